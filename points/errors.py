@@ -1,0 +1,167 @@
+"""Every error of the project, one tree, the same in process and over the wire.
+
+StraightPCFError
+├── InvalidRequest          the request itself is wrong
+│   ├── InvalidOptions      an option has a value outside its range
+│   ├── UnknownFormat       no format recognises the file
+│   ├── MissingDependency   the format or device needs an extra that is not installed
+│   └── InvalidCloud        the file or array is no usable cloud
+│       ├── MalformedFile   a file breaks its own format
+│       ├── TooFewPoints    fewer usable points than the smallest patch
+│       └── UnsupportedCloud  well-formed, but outside what we keep losslessly
+├── TooLarge                a limit was passed
+│   ├── TooManyPoints
+│   └── TooManyBytes
+├── DeviceUnavailable       the requested device is not here
+├── ServerBusy              try again later
+├── JobCanceled
+└── InternalError           our fault
+    └── ConnectionFailed    the server did not answer (raised by the SDK)
+
+`code` is stable: the wire carries it, and the SDK raises the class that has it.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+__all__ = [
+    "ERRORS_BY_CODE",
+    "ConnectionFailed",
+    "DeviceUnavailable",
+    "InternalError",
+    "InvalidCloud",
+    "InvalidOptions",
+    "InvalidRequest",
+    "JobCanceled",
+    "MalformedFile",
+    "MissingDependency",
+    "ServerBusy",
+    "StraightPCFError",
+    "TooFewPoints",
+    "TooLarge",
+    "TooManyBytes",
+    "TooManyPoints",
+    "UnknownFormat",
+    "UnsupportedCloud",
+]
+
+
+class StraightPCFError(Exception):
+    """Say what is wrong, where, and the limit; `code` names the kind and `retryable` whether to try again."""
+
+    code: ClassVar[str] = "error"
+    retryable: ClassVar[bool] = False
+
+    def __init__(self, message: str, *, request_id: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.request_id = request_id
+
+
+class InvalidRequest(StraightPCFError):  # noqa: N818 - named for what is wrong, as the wire codes are
+    """Report a request that can never succeed as it stands."""
+
+    code = "invalid_request"
+
+
+class InvalidOptions(InvalidRequest):
+    """Report an option outside its range."""
+
+    code = "invalid_options"
+
+
+class UnknownFormat(InvalidRequest):
+    """Report bytes or a name that no format recognises."""
+
+    code = "unknown_format"
+
+
+class MissingDependency(InvalidRequest):
+    """Report an extra that is not installed."""
+
+    code = "missing_dependency"
+
+
+class InvalidCloud(InvalidRequest):
+    """Report a file or an array that is no usable cloud."""
+
+    code = "invalid_cloud"
+
+
+class MalformedFile(InvalidCloud):
+    """Report a file that breaks its own format, naming the place."""
+
+    code = "malformed_file"
+
+
+class TooFewPoints(InvalidCloud):
+    """Report a cloud with fewer usable points than the smallest patch."""
+
+    code = "too_few_points"
+
+
+class UnsupportedCloud(InvalidCloud):
+    """Report a well-formed file with something we could not give back losslessly."""
+
+    code = "unsupported_cloud"
+
+
+class TooLarge(StraightPCFError):  # noqa: N818
+    """Report a limit that was passed."""
+
+    code = "too_large"
+
+
+class TooManyPoints(TooLarge):
+    """Report more points than this server or format reader takes."""
+
+    code = "too_many_points"
+
+
+class TooManyBytes(TooLarge):
+    """Report more bytes than this server takes."""
+
+    code = "too_many_bytes"
+
+
+class DeviceUnavailable(StraightPCFError):  # noqa: N818
+    """Report a device that was asked for and is not here."""
+
+    code = "device_unavailable"
+
+
+class ServerBusy(StraightPCFError):  # noqa: N818
+    """Report a full queue; try again later."""
+
+    code = "server_busy"
+    retryable = True
+
+
+class JobCanceled(StraightPCFError):  # noqa: N818
+    """Report work that was canceled."""
+
+    code = "job_canceled"
+
+
+class InternalError(StraightPCFError):
+    """Report a fault of ours."""
+
+    code = "internal_error"
+
+
+class ConnectionFailed(InternalError):
+    """Report a server that did not answer, or broke off."""
+
+    code = "connection_failed"
+    retryable = True
+
+
+def _tree(cls: type[StraightPCFError]) -> dict[str, type[StraightPCFError]]:
+    codes = {cls.code: cls}
+    for child in cls.__subclasses__():
+        codes |= _tree(child)
+    return codes
+
+
+ERRORS_BY_CODE = _tree(StraightPCFError)

@@ -1,0 +1,65 @@
+"""The one vocabulary of a denoising request, shared by the library, the CLI, the SDK and the server."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from straightpcf.points.errors import InvalidOptions
+
+__all__ = ["MAX_ITERATIONS", "DenoiseOptions"]
+
+MAX_ITERATIONS = 10
+_T = TypeVar("_T", int, float)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenoiseOptions:
+    """Describe what to do with one cloud.
+
+    iterations: passes of the whole filter, 1..10, or "auto": decided from the cloud itself.
+    seed: picks the first patch seed; the same seed gives the same bytes.
+    strength: 0..1, the share of the displacement that is applied (1 = the filter's own result).
+    Raises InvalidOptions naming the value and the limit.
+    """
+
+    iterations: int | Literal["auto"] = "auto"
+    seed: int = 0
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        if self.iterations != "auto" and (
+            isinstance(self.iterations, bool)
+            or not isinstance(self.iterations, int)
+            or not 1 <= self.iterations <= MAX_ITERATIONS
+        ):
+            raise InvalidOptions(f'iterations is {self.iterations!r}; it must be "auto" or 1..{MAX_ITERATIONS}')
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
+            raise InvalidOptions(f"seed is {self.seed!r}; it must be an integer in 0..{2**32 - 1}")
+        if not (isinstance(self.strength, (int, float)) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
+            raise InvalidOptions(f"strength is {self.strength!r}; it must be in 0..1")
+
+    @classmethod
+    def parse(
+        cls, *, iterations: str | None = None, seed: str | None = None, strength: str | None = None
+    ) -> DenoiseOptions:
+        """Read options from text, as forms, query strings and command lines carry them; None keeps the default."""
+        default = cls()
+        return cls(
+            iterations=default.iterations if iterations is None else _iterations(iterations),
+            seed=default.seed if seed is None else _number("seed", int, seed),
+            strength=default.strength if strength is None else _number("strength", float, strength),
+        )
+
+
+def _iterations(text: str) -> int | Literal["auto"]:
+    return "auto" if text.strip().lower() == "auto" else _number("iterations", int, text)
+
+
+def _number(name: str, kind: type[_T], text: str) -> _T:
+    try:
+        return kind(text)
+    except ValueError:
+        raise InvalidOptions(f"{name} is {text[:40]!r}; it must be a number") from None

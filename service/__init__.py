@@ -1,0 +1,1 @@
+"""The server: jobs, workers and the REST API."""

@@ -1,0 +1,1 @@
+"""The transports: parse, hand to the engine, serialise."""
