@@ -1,0 +1,151 @@
+"""The compiled CPU loops: build once per machine, load with ctypes, call on torch tensors.
+
+The library is looked for in `kernels/lib/` (an image or a wheel may carry it), then in the user's cache,
+and otherwise compiled there with the machine's C++ compiler. Where there is none, `load()` returns None
+and the torch twins do the work: same result within rounding, several times slower.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+
+import torch
+
+__all__ = ["EdgeMax", "build", "instruction_set", "knn", "load"]
+
+_SOURCE = Path(__file__).with_name("edgeconv.cpp")
+_SHIPPED = Path(__file__).with_name("lib")
+# Newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
+_INSTRUCTION_SETS = {
+    "avx512_bf16": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx512bf16 -mavx2 -mfma -mbmi -mbmi2",
+    "avx512bw": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx2 -mfma -mbmi -mbmi2",
+    "avx2": "-mavx2 -mfma -mbmi -mbmi2",
+    "generic": "",
+}
+# A finite-only mode would let the compiler drop the comparisons that the selection relies on.
+_FLAGS = "-O3 -std=c++17 -fPIC -shared -ffast-math -fno-finite-math-only -Wno-psabi"
+_BUILD_SECONDS = 120
+
+
+@functools.cache
+def instruction_set() -> str:
+    """Name the newest instruction set this processor has among those the kernels are compiled for."""
+    try:
+        listed = set(Path("/proc/cpuinfo").read_text().split())
+    except OSError:
+        return "generic"
+    return next(name for name in _INSTRUCTION_SETS if name in listed or name == "generic")
+
+
+@functools.cache
+def load() -> ctypes.CDLL | None:
+    """Return the library for this processor, compiled if need be, or None where that is not possible."""
+    if os.environ.get("STRAIGHTPCF_NO_KERNELS"):  # the one switch: compare with the torch twins
+        return None
+    for folder in (_SHIPPED, _cache()):
+        path = folder / _file_name()
+        if path.is_file():
+            return _open(path)
+    try:
+        return _open(build(_cache()))
+    except (OSError, subprocess.SubprocessError) as exc:
+        warnings.warn(f"CPU kernels not compiled ({exc}); plain torch is used, several times slower", stacklevel=2)
+        return None
+
+
+def build(folder: Path) -> Path:
+    """Compile for this processor into `folder`; raise OSError or SubprocessError where that fails."""
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        raise OSError("no C++ compiler: install g++")
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / _file_name()
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        built = Path(scratch) / "kernel.so"
+        flags = [*_FLAGS.split(), *_INSTRUCTION_SETS[instruction_set()].split()]
+        command = [compiler, *flags, str(_SOURCE), "-o", str(built)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_SECONDS, check=False)
+        if done.returncode != 0:
+            raise OSError(f"{compiler} failed: {done.stderr.strip()[:500]}")
+        built.replace(target)  # atomic: two processes may build at once
+    return target
+
+
+def _cache() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "straightpcf"
+
+
+@functools.cache
+def _file_name() -> str:
+    digest = hashlib.sha256(_SOURCE.read_bytes() + _FLAGS.encode()).hexdigest()[:12]
+    return f"edgeconv-{platform.machine()}-{instruction_set()}-{digest}.so"
+
+
+def _open(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
+    for name in ("knn", "pack", "edge_max", "edge_max_backward"):
+        getattr(library, f"straightpcf_{name}").restype = None
+    library.straightpcf_products_are_bf16.restype = ctypes.c_int
+    return library
+
+
+def _at(tensor: torch.Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+def knn(library: ctypes.CDLL, x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
+    """Return (B, rows, k) int32 neighbours of the first `rows` points of each patch, x: (B, P, C) float32."""
+    batch, count, dims = x.shape
+    x = x.detach().contiguous()
+    out = torch.empty(batch, rows, k, dtype=torch.int32)
+    for patch, index in zip(x, out, strict=True):
+        library.straightpcf_knn(_at(patch), count, dims, rows, k, _at(index))
+    return out
+
+
+class EdgeMax(torch.autograd.Function):
+    """max_n W relu(a_i + b_index[i, n]) and its gradient; shapes as in `ops.edge_max`."""
+
+    @staticmethod
+    def forward(ctx, library, a, b, index, weight, want_grad):  # type: ignore[no-untyped-def]
+        """Run the kernel patch by patch; remember the winning edge only where a gradient will be asked for."""
+        batch, rows, width = a.shape
+        k, out_width = index.shape[2], weight.shape[0]
+        a, b, weight = a.contiguous(), b.contiguous(), weight.contiguous()
+        packed = torch.empty_like(weight)
+        library.straightpcf_pack(_at(weight), width, out_width, _at(packed))
+        out = torch.empty(batch, rows, out_width)
+        arg = torch.empty(batch, rows, out_width, dtype=torch.uint8) if want_grad else None
+        for i in range(batch):
+            library.straightpcf_edge_max(
+                _at(a[i]), _at(b[i]), _at(index[i]), _at(packed), rows, k, width, out_width, _at(out[i]),
+                _at(None if arg is None else arg[i]),
+            )  # fmt: skip
+        if arg is not None:
+            ctx.library = library
+            ctx.save_for_backward(a, b, index, weight, arg)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        """Follow the winning edges back."""
+        a, b, index, weight, arg = ctx.saved_tensors
+        batch, rows, width = a.shape
+        grad = grad.contiguous()
+        grad_a, grad_b, grad_weight = torch.empty_like(a), torch.zeros_like(b), torch.zeros_like(weight)
+        for i in range(batch):
+            ctx.library.straightpcf_edge_max_backward(
+                _at(grad[i]), _at(arg[i]), _at(a[i]), _at(b[i]), _at(index[i]), _at(weight), rows, index.shape[2],
+                width, weight.shape[0], _at(grad_a[i]), _at(grad_b[i]), _at(grad_weight),
+            )  # fmt: skip
+        return None, grad_a, grad_b, None, grad_weight, None

@@ -1,0 +1,65 @@
+"""VelocityModule, DistanceModule and their composition, StraightPCF (de Silva Edirimuni et al., CVPR 2024)."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from straightpcf.model.nets.edgeconv import Decoder, Encoder
+
+__all__ = ["DistanceModule", "StraightPCF", "VelocityModule"]
+
+
+class VelocityModule(nn.Module):
+    """v(X): the constant velocity that carries a noisy patch to the surface in unit time (section 4.1)."""
+
+    def __init__(self, width: int = 256) -> None:
+        super().__init__()
+        self.encoder = Encoder(width)
+        self.decoder = Decoder(width, 3)
+
+    def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
+        """Return (B, rows, 3) velocities of the first `rows` points of each patch x (B, P, 3)."""
+        return self.decoder(self.encoder(x, rows))  # type: ignore[no-any-return]
+
+    def start_slow(self) -> VelocityModule:
+        """Shrink the last layer so that training starts from velocities near zero; they are about 0.02."""
+        with torch.no_grad():
+            self.decoder.lin_3.weight.mul_(0.01)
+            self.decoder.lin_3.bias.zero_()
+        return self
+
+
+class DistanceModule(nn.Module):
+    """d(X) in (0, 1): how far from the surface a patch is, in units of the training noise (section 4.3)."""
+
+    def __init__(self, width: int = 128) -> None:
+        super().__init__()
+        self.encoder = Encoder(width)
+        self.decoder = Decoder(width, 1, pool=True)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return (B, 1) distances of patches x (B, P, 3), centred on their seeds."""
+        radius = x.norm(dim=2).amax(dim=1).clamp_min(1e-12)  # (B,)
+        return torch.sigmoid(self.decoder(self.encoder(x / radius[:, None, None])))
+
+
+class StraightPCF(nn.Module):
+    """K coupled VelocityModules whose trajectory the DistanceModule scales (section 4.2 and 4.3)."""
+
+    def __init__(self, *, couplings: int = 2, width: int = 256, distance_width: int = 128) -> None:
+        super().__init__()
+        self.velocity_modules = nn.ModuleList(VelocityModule(width) for _ in range(couplings))
+        self.distance_module = DistanceModule(distance_width)
+
+    def forward(self, x: torch.Tensor, *, euler_steps: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+        """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
+
+        Returns the moved patches (B, P, 3) and their distances d (B, 1).
+        """
+        distance = self.distance_module(x)
+        step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
+        for _ in range(euler_steps):
+            for velocity in self.velocity_modules:
+                x = x + step * velocity(x)
+        return x, distance

@@ -1,0 +1,54 @@
+"""Neighbour search and the EdgeConv maximum: the plain torch definitions, and the choice of a faster path."""
+
+from __future__ import annotations
+
+import torch
+
+from straightpcf.model.kernels import cpu
+
+__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch"]
+
+
+def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
+    """Find each point's k nearest others inside its patch.
+
+    x: (B, P, C) float32, P > 1; rows: only for the first `rows` points, all if None.
+    Returns (B, rows, k) indices into P, int32 on the CPU and int64 elsewhere. k > P - 1 repeats the farthest.
+    """
+    rows = x.shape[1] if rows is None else rows
+    library = cpu.load() if x.device.type == "cpu" and x.dtype == torch.float32 and k <= 64 else None
+    return knn_torch(x, k, rows) if library is None else cpu.knn(library, x, k, rows)
+
+
+def knn_torch(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
+    """Do what `knn` does with a full distance matrix and `torch.topk`."""
+    x = x.detach()
+    direct = x.shape[2] < 8  # exact differences where they are cheap
+    mode = "donot_use_mm_for_euclid_dist" if direct else "use_mm_for_euclid_dist"
+    distance = torch.cdist(x[:, :rows], x, compute_mode=mode)
+    distance[:, torch.arange(rows), torch.arange(rows)] = torch.inf
+    found = min(k, x.shape[1] - 1)
+    index = distance.topk(found, dim=2, largest=False).indices
+    return index if found == k else torch.cat([index, index[:, :, -1:].expand(-1, -1, k - found)], dim=2)
+
+
+def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Take the maximum over a point's edges of the second layer of an EdgeConv.
+
+    a: (B, M, C) the point's own share of the first layer; b: (B, P, C) its neighbours' share;
+    index: (B, M, k) into P; weight: (D, C). Returns (B, M, D): max_n weight @ relu(a_i + b_index[i, n]).
+    """
+    plain = a.dtype == torch.float32 and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
+    library = cpu.load() if plain and a.device.type == "cpu" and index.dtype == torch.int32 else None
+    if library is None:
+        return edge_max_torch(a, b, index, weight)
+    want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
+    return cpu.EdgeMax.apply(library, a, b, index, weight, want_grad)  # type: ignore[no-untyped-call,no-any-return]
+
+
+def edge_max_torch(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Do what `edge_max` does with a gathered (B, M, k, C) tensor."""
+    batch, rows, k = index.shape
+    flat = index.reshape(batch, rows * k, 1).long().expand(-1, -1, b.shape[2])
+    neighbours = b.gather(1, flat).view(batch, rows, k, -1)  # (B, M, k, C)
+    return (torch.relu(a.unsqueeze(2) + neighbours) @ weight.T).amax(dim=2)

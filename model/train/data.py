@@ -1,0 +1,91 @@
+"""Training patches: clean and noisy versions of the same points, cut as the filter will cut them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from straightpcf.points.errors import InvalidOptions
+
+__all__ = ["NOISE_STD", "PATCH_SIZE", "VALIDATION_SHAPES", "Batch", "PatchSource"]
+
+PATCH_SIZE = 1000
+NOISE_STD = 0.02  # of x_0, in radii of the cloud's bounding sphere
+SCALES = (0.8, 1.2)  # augmentation
+# Every tenth shape by name stays out of training, so that there is something honest to choose by.
+VALIDATION_SHAPES = 10
+# Noise moves points in and out of a patch: the noisy patch is chosen among this many clean neighbours.
+_CANDIDATES = 1300
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B patches, the points of each in random order, in the frame of the seed's noisy position at time t.
+
+    noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [0, 1).
+    """
+
+    noisy: torch.Tensor
+    clean: torch.Tensor
+    time: torch.Tensor
+
+    def at(self, time: torch.Tensor) -> torch.Tensor:
+        """Return x_t = (1 - t) x_0 + t y, (B, P, 3)."""
+        return torch.lerp(self.noisy, self.clean, time)
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the same batch on another device."""
+        return Batch(self.noisy.to(device), self.clean.to(device), self.time.to(device))
+
+
+class PatchSource:
+    """Draw patches from clean clouds, each in the frame where its bounding sphere has radius 1."""
+
+    def __init__(self, clouds: list[npt.NDArray[np.float32]]) -> None:
+        if not clouds:
+            raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
+        self._clouds = [_normalised(cloud) for cloud in clouds]
+        self._trees = [cKDTree(cloud) for cloud in self._clouds]
+
+    @classmethod
+    def read(cls, path: Path, *, validation: bool = False) -> PatchSource:
+        """Read an .npz of clean clouds named `<shape>/<resolution>`: the training shapes, or the held-out ones."""
+        with np.load(path, allow_pickle=False) as archive:
+            shapes = sorted({name.split("/")[0] for name in archive.files})
+            held_out = set(shapes[VALIDATION_SHAPES // 2 :: VALIDATION_SHAPES])
+            return cls([archive[name] for name in archive.files if (name.split("/")[0] in held_out) == validation])
+
+    def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
+        """Draw a batch; all randomness comes from `rng`."""
+        pairs = [self._patch(rng, augment=augment) for _ in range(batch_size)]
+        noisy, clean, time = (np.stack(part).astype(np.float32) for part in zip(*pairs, strict=True))
+        return Batch(torch.from_numpy(noisy), torch.from_numpy(clean), torch.from_numpy(time).view(-1, 1, 1))
+
+    def _patch(self, rng: np.random.Generator, *, augment: bool) -> tuple[npt.NDArray[np.float64], ...]:
+        which = int(rng.integers(len(self._clouds)))
+        cloud, tree = self._clouds[which], self._trees[which]
+        seed = cloud[rng.integers(len(cloud))]
+        _, near = tree.query(seed, k=min(_CANDIDATES, len(cloud)))
+        clean = cloud[near]  # row 0 is the seed
+        noisy = clean + NOISE_STD * rng.standard_normal(clean.shape)
+        distance = np.square(noisy - noisy[0]).sum(axis=1)
+        inside = np.argpartition(distance, PATCH_SIZE - 1)[:PATCH_SIZE]
+        time = rng.random()
+        origin = (1 - time) * noisy[0] + time * clean[0]
+        transform = np.eye(3)
+        if augment:
+            transform = Rotation.random(random_state=rng).as_matrix() * rng.uniform(*SCALES)
+        inside = rng.permutation(inside)
+        return (noisy[inside] - origin) @ transform, (clean[inside] - origin) @ transform, np.float64(time)
+
+
+def _normalised(cloud: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    xyz = cloud.astype(np.float64)
+    xyz -= (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+    return xyz / np.linalg.norm(xyz, axis=1).max()

@@ -1,0 +1,164 @@
+"""One linear training loop for the three stages."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from straightpcf.model.allocator import keep_large_buffers
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.train.data import Batch, PatchSource
+from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
+from straightpcf.model.train.state import Average, load_state, read_network, save_state
+from straightpcf.points.errors import InvalidOptions
+
+__all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
+
+Stage = Literal["vm", "cvm", "dm"]
+STATE_FILE = "state.safetensors"
+_LOSSES = {"vm": velocity_loss, "cvm": coupled_loss, "dm": distance_loss}
+_WARMUP = 200
+_EMA_DECAY = 0.999
+_LOG_EVERY = 50
+_VALIDATE_EVERY = 250
+_VALIDATION_PATCHES = 64
+
+
+@dataclass(frozen=True)
+class TrainStep:
+    """One iteration as it was: losses are relative to a network that does nothing; validation is None in between."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    validation: float | None
+    learning_rate: float
+
+
+def train(
+    stage: Stage,
+    *,
+    data: Path,
+    run_dir: Path,
+    iterations: int,
+    batch_size: int = 16,
+    learning_rate: float = 1e-3,
+    rows: int = 256,
+    couplings: int = 2,
+    seed: int = 0,
+    device: str = "cpu",
+    threads: int | None = None,
+    init: Path | None = None,
+    on_step: Callable[[TrainStep], None] | None = None,
+) -> Path:
+    """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
+
+    init: the state of the stage before (needed by "cvm" and "dm" on a fresh run). rows: points of a patch
+    in the loss. The learning rate warms up, then falls along half a cosine to 2 % at `iterations`.
+    Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
+    and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
+    """
+    if threads is not None:
+        torch.set_num_threads(threads)
+    keep_large_buffers()
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    state_path = run_dir / STATE_FILE
+    place = torch.device(device)
+
+    network = _network(stage, None if state_path.exists() else init, couplings, resuming=state_path.exists()).to(place)
+    trained = _trained_part(stage, network)
+    optimiser = torch.optim.Adam(trained.parameters(), lr=learning_rate, betas=(0.9, 0.99))
+    average = Average(network, _EMA_DECAY)
+    start = load_state(state_path, network, average, optimiser, rng)["iteration"] if state_path.exists() else 0
+
+    source = PatchSource.read(data)
+    fixed = PatchSource.read(data, validation=True).draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
+    began = time.monotonic()
+    validation: float | None = None
+    with (run_dir / "log.csv").open("a", newline="") as file:
+        log = csv.writer(file)
+        if start == 0:
+            log.writerow(["stage", "iteration", "loss", "validation", "learning_rate", "seconds"])
+        recent: list[float] = []
+        for iteration in range(start + 1, iterations + 1):
+            rate = _learning_rate(learning_rate, iteration, iterations)
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            batch = source.draw(rng, batch_size).to(place)
+            trained.train()
+            loss = _LOSSES[stage](network, batch, rows)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(trained.parameters(), 1.0)
+            optimiser.step()
+            average.update(network, iteration)
+
+            recent.append(loss.item())
+            if not math.isfinite(recent[-1]):
+                raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
+            if iteration % _VALIDATE_EVERY == 0 or iteration == iterations:
+                validation = _validate(stage, network, average, fixed.to(place), rows)
+                progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
+                            "learning_rate": learning_rate, "validation": validation}  # fmt: skip
+                save_state(state_path, network, average, optimiser, rng, progress)
+            if iteration % _LOG_EVERY == 0 or iteration == iterations:
+                seconds = round(time.monotonic() - began, 1)
+                log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
+                file.flush()
+                recent.clear()
+            if on_step is not None:
+                on_step(TrainStep(iteration, iterations, loss.item(), validation, rate))
+            validation = None
+    return state_path
+
+
+def _network(stage: Stage, init: Path | None, couplings: int, *, resuming: bool) -> StraightPCF:
+    count = 1 if stage == "vm" else couplings
+    if stage == "vm" or resuming:
+        network = StraightPCF(couplings=count)
+        for module in network.velocity_modules:
+            module.start_slow()  # type: ignore[operator]
+    elif init is None:
+        raise InvalidOptions(f"stage {stage!r} starts from the stage before: give its {STATE_FILE} as init")
+    else:
+        network, _ = read_network(init)
+        have = len(network.velocity_modules)
+        if stage == "cvm" and have == 1:
+            first = network.velocity_modules[0]
+            network.velocity_modules.extend(copy.deepcopy(first) for _ in range(count - 1))
+        elif have != count:
+            raise InvalidOptions(f"{init} has {have} coupled modules; this run wants {count}")
+    if stage == "dm":
+        network.velocity_modules.requires_grad_(requires_grad=False)
+    return network.eval()
+
+
+def _trained_part(stage: Stage, network: StraightPCF) -> torch.nn.Module:
+    return network.distance_module if stage == "dm" else network.velocity_modules
+
+
+def _learning_rate(peak: float, iteration: int, iterations: int) -> float:
+    if iteration < _WARMUP:
+        return peak * iteration / _WARMUP
+    done = (iteration - _WARMUP) / max(1, iterations - _WARMUP)
+    return peak * (0.02 + 0.98 * (1 + math.cos(math.pi * done)) / 2)
+
+
+@torch.no_grad()
+def _validate(stage: Stage, network: StraightPCF, average: Average, fixed: Batch, rows: int) -> float:
+    averaged = copy.deepcopy(network)
+    averaged.load_state_dict(average.tensors)
+    averaged.eval()
+    parts = zip(fixed.noisy.split(8), fixed.clean.split(8), fixed.time.split(8), strict=True)
+    return round(float(np.mean([_LOSSES[stage](averaged, Batch(*part), rows).item() for part in parts])), 5)

@@ -1,0 +1,91 @@
+"""What a training run needs to go on: weights, their average, optimiser, random states, in one safetensors file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.points.errors import MalformedFile
+
+__all__ = ["Average", "load_state", "read_network", "save_state"]
+
+
+class Average:
+    """Keep an exponential moving average of a network's weights and buffers."""
+
+    def __init__(self, network: StraightPCF, decay: float) -> None:
+        self.decay = decay
+        self.tensors = {name: t.detach().clone() for name, t in network.state_dict().items()}
+
+    @torch.no_grad()
+    def update(self, network: StraightPCF, iteration: int) -> None:
+        """Take one step; early on the window is short, so that the random start is forgotten."""
+        decay = min(self.decay, (1 + iteration) / (10 + iteration))
+        for name, tensor in network.state_dict().items():
+            mean = self.tensors[name]
+            if mean.is_floating_point():
+                mean.lerp_(tensor, 1 - decay)
+            else:
+                mean.copy_(tensor)
+
+
+def save_state(
+    path: Path, network: StraightPCF, average: Average, optimiser: torch.optim.Optimizer, rng: np.random.Generator,
+    progress: dict[str, Any],
+) -> None:  # fmt: skip
+    """Write everything that `load_state` restores; the file replaces the old one whole."""
+    tensors = {f"weights.{name}": t.detach().clone().contiguous() for name, t in network.state_dict().items()}
+    tensors |= {f"average.{name}": t.contiguous() for name, t in average.tensors.items()}
+    for index, moments in optimiser.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": torch.as_tensor(t).clone() for name, t in moments.items()}
+    tensors["torch_rng"] = torch.get_rng_state()
+    metadata = {"progress": json.dumps(progress), "numpy_rng": json.dumps(rng.bit_generator.state)}
+    scratch = path.with_suffix(".tmp")
+    save_file(tensors, scratch, metadata=metadata)
+    scratch.replace(path)
+
+
+def load_state(
+    path: Path, network: StraightPCF, average: Average, optimiser: torch.optim.Optimizer, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Restore a run in place and return its progress as saved."""
+    tensors, metadata = _read(path)
+    network.load_state_dict(_under(tensors, "weights."))
+    average.tensors = {name: t.to(average.tensors[name].device) for name, t in _under(tensors, "average.").items()}
+    moments: dict[int, dict[str, torch.Tensor]] = {}
+    for name, tensor in _under(tensors, "adam.").items():
+        index, moment = name.split(".")
+        moments.setdefault(int(index), {})[moment] = tensor
+    optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})
+    torch.set_rng_state(tensors["torch_rng"])
+    rng.bit_generator.state = json.loads(metadata["numpy_rng"])
+    return dict(json.loads(metadata["progress"]))
+
+
+def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
+    """Return the averaged network of a run's state and the run's progress."""
+    tensors, metadata = _read(path)
+    average = _under(tensors, "average.")
+    couplings = len({name.split(".")[1] for name in average if name.startswith("velocity_modules.")})
+    network = StraightPCF(couplings=couplings)
+    network.load_state_dict(average)
+    return network, dict(json.loads(metadata["progress"]))
+
+
+def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
+        if "progress" not in metadata:
+            raise MalformedFile(f"{path} is no training state: its header has no progress")
+        return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
+
+
+def _under(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
