@@ -1,0 +1,265 @@
+"""The filter: a cloud in, the same points on the surface out; the paper in named stages."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from straightpcf.model.allocator import keep_large_buffers
+from straightpcf.model.calibration import Calibration
+from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.normalize import CloudFrame, patch_scales
+from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches
+from straightpcf.points.errors import DeviceUnavailable, TooFewPoints
+from straightpcf.points.options import DenoiseOptions
+
+__all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "denoise", "load_filter"]
+
+DEFAULT_WEIGHTS = Path(__file__).with_name("weights") / "straightpcf.safetensors"
+MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
+EULER_STEPS = 3
+COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RESULTS.md compares)
+_PROBES = 48  # patches on which "auto" reads the noise
+_CUDA_BATCH = 32
+
+
+@dataclass(frozen=True)
+class FinishedPatch:
+    """Points whose position in this pass is settled: no other patch of the pass changes them.
+
+    indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
+    final: whether this is the last pass; progress: 0..1, of the whole job as far as it can be foreseen.
+    """
+
+    indices: npt.NDArray[np.int64]
+    xyz: npt.NDArray[np.float64]
+    iteration: int
+    final: bool
+    progress: float
+
+
+@dataclass(frozen=True)
+class DenoiseResult:
+    """The filtered cloud and how it came about.
+
+    xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
+    untouched: rows that were not finite and passed through.
+    """
+
+    xyz: npt.NDArray[np.float64]
+    iterations: int
+    noise_before: float
+    noise_after: float
+    untouched: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+
+def load_filter(weights: Path | None = None, *, device: str = "auto", threads: int | None = None) -> Filter:
+    """Load a network, the shipped one by default, onto "cpu", "cuda" or the better one present ("auto").
+
+    threads: CPU threads, all cores by default; the result does not depend on it. Raises DeviceUnavailable for
+    a device that is not here, MalformedFile for weights that do not fit.
+    """
+    if device not in ("auto", "cpu", "cuda"):
+        raise DeviceUnavailable(f'device is {device!r}; it must be "auto", "cpu" or "cuda"')
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DeviceUnavailable("device cuda was asked for, and torch sees no CUDA device here")
+    chosen = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    path = DEFAULT_WEIGHTS if weights is None else weights
+    network = load_checkpoint(path, device=chosen)
+    calibration = Calibration.from_metadata(read_checkpoint(path)[1])
+    return Filter(network, calibration=calibration, device=chosen, threads=threads)
+
+
+def denoise(xyz: npt.ArrayLike, *, iterations: int | str = "auto", seed: int = 0, device: str = "auto") -> DenoiseResult:
+    """Filter (N, 3) points with the shipped weights: `load_filter` and `Filter.denoise` in one call."""
+    options = DenoiseOptions.parse(iterations=str(iterations), seed=str(seed))
+    return load_filter(device=device).denoise(np.asarray(xyz, dtype=np.float64), options)
+
+
+class Filter:
+    """A loaded network with the stages around it; safe to use again, from one thread at a time."""
+
+    def __init__(
+        self,
+        network: StraightPCF,
+        *,
+        calibration: Calibration | None = None,
+        device: str = "cpu",
+        threads: int | None = None,
+        coverage: float = COVERAGE,
+        euler_steps: int = EULER_STEPS,
+    ) -> None:
+        self.network = network.eval().requires_grad_(requires_grad=False)
+        self.calibration = calibration or Calibration()
+        self.device = device
+        self.threads = threads or os.cpu_count() or 1
+        self.coverage = coverage
+        self.euler_steps = euler_steps
+        keep_large_buffers()
+
+    def denoise(
+        self,
+        xyz: npt.NDArray[np.float64],
+        options: DenoiseOptions | None = None,
+        *,
+        on_progress: Callable[[float], None] | None = None,
+    ) -> DenoiseResult:
+        """Move (N, 3) points to the surface; an exception raised by on_progress (0..1) ends the work.
+
+        Raises TooFewPoints below MIN_POINTS finite rows.
+        """
+        run = _Run(self, xyz, options or DenoiseOptions())
+        began = time.monotonic()
+        for patch in run.patches():
+            if on_progress is not None:
+                on_progress(patch.progress)
+        return run.result(time.monotonic() - began)
+
+    def patches(
+        self, xyz: npt.NDArray[np.float64], options: DenoiseOptions | None = None
+    ) -> Iterator[FinishedPatch]:
+        """Yield patches of (N, 3) points as they are settled; those with `final` add up to the result.
+
+        Rows that are not finite belong to no patch. Order and batching never change a position.
+        """
+        return _Run(self, xyz, options or DenoiseOptions()).patches()
+
+
+class _Run:
+    """One cloud on its way through the filter."""
+
+    def __init__(self, owner: Filter, xyz: npt.NDArray[np.float64], options: DenoiseOptions) -> None:
+        if xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise TooFewPoints(f"points must be (N, 3), got {xyz.shape}")
+        self.filter, self.options, self.xyz = owner, options, xyz
+        self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        if len(self.rows) < MIN_POINTS:
+            untouched = len(xyz) - len(self.rows)
+            raise TooFewPoints(f"{len(self.rows)} points to filter ({untouched} not finite); at least {MIN_POINTS}")
+        self.frame = CloudFrame.of(xyz[self.rows])
+        self.iterations = 0
+        self.moved = np.zeros((len(self.rows), 3))  # in the unit-ball frame
+        self.noise = [0.0, 0.0]
+
+    def patches(self) -> Iterator[FinishedPatch]:
+        """Run pass after pass."""
+        if self.frame.radius == 0.0:
+            return
+        start = self.frame.enter(self.xyz[self.rows])
+        planned = None if self.options.iterations == "auto" else self.options.iterations
+        with ThreadPoolExecutor(self.filter.threads, initializer=_one_thread) as pool:
+            while True:
+                here = start + self.moved
+                cut = cut_patches(here, coverage=self.filter.coverage, seed=self.options.seed)
+                self.noise[1] = self._noise(here, cut, pool)
+                if self.iterations == 0:
+                    self.noise[0] = self.noise[1]
+                left = self._passes_left(planned)
+                if left == 0:
+                    return
+                self.iterations += 1
+                yield from self._pass(here, cut, pool, left)
+
+    def result(self, seconds: float) -> DenoiseResult:
+        """Put the moved rows back among the others."""
+        out = self.xyz.copy()
+        out[self.rows] += self.options.strength * self.frame.radius * self.moved
+        untouched = len(out) - len(self.rows)
+        warnings = [f"{untouched} points are not finite and were passed through"] if untouched else []
+        if self.frame.radius == 0.0:
+            warnings.append("all points coincide: nothing to filter")
+        before, after = (self.frame.radius * noise for noise in self.noise)
+        return DenoiseResult(out, self.iterations, before, after, untouched, seconds, tuple(warnings))
+
+    def _passes_left(self, planned: int | None) -> int:
+        if planned is not None:
+            return planned - self.iterations
+        return self.filter.calibration.passes_left(self.distance, done=self.iterations)
+
+    def _pass(
+        self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor, left: int
+    ) -> Iterator[FinishedPatch]:
+        scales = patch_scales(cut.radii)
+        done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
+        # The patches are cut from `here`, so results may be written into self.moved as they come.
+        for n, (patch, displacement) in enumerate(self._displacements(here, cut, scales, pool), start=1):
+            rows = cut.owned_rows(patch)
+            indices = cut.index[patch][rows]
+            self.moved[indices] += displacement[rows] / scales[patch]
+            xyz = self.xyz[self.rows[indices]] + self.options.strength * self.frame.radius * self.moved[indices]
+            progress = (done_before + n / len(cut.seeds)) * share
+            yield FinishedPatch(self.rows[indices], xyz, self.iterations, left == 1, progress)
+
+    def _displacements(
+        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
+    ) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
+        """Run the network over all patches; yield each one's (P, 3) displacement in its own scale."""
+        step = 1 if self.filter.device == "cpu" else _CUDA_BATCH
+
+        def move(first: int) -> npt.NDArray[np.float64]:
+            x = self._tensor(here, cut, scales, range(first, min(first + step, len(cut.seeds))))
+            moved, _ = self.filter.network(x, euler_steps=self.filter.euler_steps)
+            return (moved - x).double().cpu().numpy()  # type: ignore[no-any-return]
+
+        starts = range(0, len(cut.seeds), step)
+        for first, displacements in zip(starts, _bounded_map(pool, move, starts, 2 * self.filter.threads), strict=True):
+            yield from enumerate(displacements, start=first)
+
+    def _tensor(
+        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], chosen: range | list[int]
+    ) -> torch.Tensor:
+        local = [(here[cut.index[i]] - here[cut.seeds[i]]) * scales[i] for i in chosen]
+        return torch.from_numpy(np.stack(local).astype(np.float32)).to(self.filter.device)  # (B, P, 3)
+
+    def _noise(self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor) -> float:
+        """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame."""
+        count = len(cut.seeds)
+        probes = list(range(0, count, max(1, count // _PROBES)))
+        scales = patch_scales(cut.radii)
+
+        def read(patch: int) -> float:
+            with torch.inference_mode():
+                return float(self.filter.network.distance_module(self._tensor(here, cut, scales, [patch])))
+
+        distances = np.array(list(pool.map(read, probes)))
+        self.distance = float(np.median(distances))
+        return float(np.median(self.filter.calibration.noise_std(distances) / scales[probes]))
+
+
+def _one_thread() -> None:
+    # Patches run side by side, one per thread; inside a patch more threads would only wait for each other.
+    torch.set_num_threads(1)
+
+
+def _bounded_map(
+    pool: ThreadPoolExecutor, function: Callable[[int], npt.NDArray[np.float64]], items: range, ahead: int
+) -> Iterator[npt.NDArray[np.float64]]:
+    """Map in order with at most `ahead` results waiting, so that a slow reader does not fill the memory."""
+    waiting: deque[Future[npt.NDArray[np.float64]]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(_inference, function, item))
+            if len(waiting) >= ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _inference(function: Callable[[int], npt.NDArray[np.float64]], item: int) -> npt.NDArray[np.float64]:
+    with torch.inference_mode():  # the mode belongs to a thread
+        return function(item)

@@ -1,0 +1,47 @@
+"""The frames the filter works in: one for the cloud, in float64, and one scale for each patch, for the network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["CloudFrame", "patch_scales"]
+
+# Patch radii seen in training, in radii of the object's bounding sphere: the 1st and 99th percentile of
+# punet_train.npz at 10K to 50K points (docs/training.md says how they were measured).
+_SMALLEST_RADIUS, _LARGEST_RADIUS = 0.13, 0.58
+
+
+@dataclass(frozen=True)
+class CloudFrame:
+    """The cloud's own frame: bounding-box centre (3,) float64 and the largest distance from it, in the cloud's unit."""
+
+    centre: npt.NDArray[np.float64]
+    radius: float
+
+    @classmethod
+    def of(cls, xyz: npt.NDArray[np.float64]) -> CloudFrame:
+        """Measure finite points (N, 3); the radius is 0 where they all coincide."""
+        low, high = xyz.min(axis=0), xyz.max(axis=0)
+        centre = low / 2 + high / 2  # halves first: the sum may overflow
+        extent = float(np.abs(xyz - centre).max())
+        if extent == 0.0:
+            return cls(centre, 0.0)
+        return cls(centre, extent * float(np.linalg.norm((xyz - centre) / extent, axis=1).max()))
+
+    def enter(self, xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return (N, 3) float64 positions in the unit ball."""
+        return (xyz - self.centre) / self.radius
+
+
+def patch_scales(radii: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the factor that brings each patch of the unit-ball cloud to a size the network knows, (M,) float64.
+
+    Patches of an object sampled like the training clouds keep their size: then this is the paper's frame.
+    A street or a LiDAR frame has patches far smaller or larger than that beside its bounding sphere; they
+    are scaled to the nearest size seen in training. A patch of radius 0 keeps the factor 1.
+    """
+    wanted = np.clip(radii, _SMALLEST_RADIUS, _LARGEST_RADIUS)
+    return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

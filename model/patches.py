@@ -1,0 +1,93 @@
+"""Cut a cloud into overlapping kNN patches and give every point one owner among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import fpsample
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+__all__ = ["PATCH_SIZE", "Patches", "cut_patches"]
+
+PATCH_SIZE = 1000
+# Farthest-point sampling is exact and cheap up to this many points; larger clouds are sampled bucket by bucket.
+_BUCKET_HEIGHT = 7
+
+
+@dataclass(frozen=True)
+class Patches:
+    """M patches of P points of one cloud.
+
+    seeds: (M,) int64 rows; index: (M, P) int32 rows, nearest to the seed first; radii: (M,) float64 distance
+    to the farthest; owner: (N,) int32, the patch that has the last word on each point.
+    """
+
+    seeds: npt.NDArray[np.int64]
+    index: npt.NDArray[np.int32]
+    radii: npt.NDArray[np.float64]
+    owner: npt.NDArray[np.int32]
+
+    def owned_rows(self, patch: int) -> npt.NDArray[np.intp]:
+        """Return the positions inside a patch of the points that it owns."""
+        return np.flatnonzero(self.owner[self.index[patch]] == patch)
+
+
+def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE) -> Patches:
+    """Cut (N, 3) float64 points into patches that cover every one of them.
+
+    coverage: how many patches a point is in on average, at the start; farthest-point seeds are added in what
+    is left uncovered until nothing is. A point's owner is the patch to whose seed it is nearest in units of
+    that patch's radius (the first of equals). `seed` picks the first seed. Memory is O(coverage N).
+    """
+    count = len(xyz)
+    size = min(patch_size, count)
+    first = seed % count
+    tree = cKDTree(xyz)
+    wanted = 1 if count <= patch_size else max(1, int(np.ceil(coverage * count / size)))
+    seeds = _farthest(xyz, wanted, first)
+    distance, index = _nearest(tree, xyz[seeds], size)
+    covered = np.zeros(count, dtype=bool)
+    covered[index] = True
+    while not covered.all():
+        left = np.flatnonzero(~covered)
+        more = left[_farthest(xyz[left], max(1, int(np.ceil(2 * len(left) / size))), 0)]
+        more_distance, more_index = _nearest(tree, xyz[more], size)
+        # Among equal points the tree may leave out the seed itself; it must be in its own patch.
+        more_index[~(more_index == more[:, None]).any(axis=1), -1] = more[~(more_index == more[:, None]).any(axis=1)]
+        covered[more_index] = True
+        seeds = np.concatenate([seeds, more])
+        distance, index = np.concatenate([distance, more_distance]), np.concatenate([index, more_index])
+    return Patches(seeds, index, distance[:, -1].astype(np.float64), _owners(distance, index, count))
+
+
+def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDArray[np.int64]:
+    if wanted >= len(xyz):
+        return np.arange(len(xyz), dtype=np.int64)
+    if wanted == 1:
+        return np.array([first], dtype=np.int64)
+    return np.asarray(
+        fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), wanted, _BUCKET_HEIGHT, first), dtype=np.int64
+    )
+
+
+def _nearest(
+    tree: cKDTree, queries: npt.NDArray[np.float64], size: int
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    distance, index = tree.query(queries, k=np.arange(1, size + 1), workers=-1)
+    return distance.astype(np.float32), index.astype(np.int32)
+
+
+def _owners(
+    distance: npt.NDArray[np.float32], index: npt.NDArray[np.int32], count: int
+) -> npt.NDArray[np.int32]:
+    radius = distance[:, -1:]
+    relative = distance / np.where(radius > 0, radius, 1)
+    best = np.full(count, np.inf, dtype=np.float32)
+    owner = np.zeros(count, dtype=np.int32)
+    for patch, (rows, ratios) in enumerate(zip(index, relative, strict=True)):
+        nearer = ratios < best[rows]
+        best[rows[nearer]] = ratios[nearer]
+        owner[rows[nearer]] = patch
+    return owner
