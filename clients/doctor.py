@@ -1,0 +1,64 @@
+"""Find out what this machine has of what denoising needs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from typing import Any
+
+import straightpcf
+from straightpcf.points.errors import StraightPCFError
+
+__all__ = ["examine"]
+
+EXTRAS = {
+    "model": ("torch", "scipy", "fpsample", "safetensors"),
+    "service": ("fastapi", "uvicorn", "pydantic", "python-multipart"),
+    "las": ("laspy", "lazrs"),
+    "open3d": ("open3d",),
+}
+
+
+def examine() -> tuple[dict[str, Any], bool]:
+    """Return what was found, and whether a cloud can be denoised here."""
+    findings: dict[str, Any] = {
+        "straightpcf": straightpcf.__version__,
+        "python": f"{platform.python_version()} on {platform.platform()}",
+        "extras": {extra: _extra(packages) for extra, packages in EXTRAS.items()},
+    }
+    try:
+        findings |= _examine_model()
+    except ModuleNotFoundError as exc:
+        return findings | {"problem": f"{exc.name} is not installed; pip install 'straightpcf[model]'"}, False
+    except StraightPCFError as exc:
+        return findings | {"problem": f"[{exc.code}] {exc.message}"}, False
+    except OSError as exc:
+        return findings | {"problem": str(exc)}, False
+    return findings, True
+
+
+def _examine_model() -> dict[str, Any]:
+    import torch
+
+    from straightpcf.model.filter import load_filter
+
+    names = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
+    denoiser = load_filter()
+    return {
+        "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
+        "cuda": ", ".join(names) or "none",
+        "device": denoiser.device,
+        "weights": "shipped, loaded",
+    }
+
+
+def _extra(packages: tuple[str, ...]) -> str:
+    missing = [name for name in packages if not _version(name)]
+    return f"missing {', '.join(missing)}" if missing else "installed"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,115 @@
+"""Read what a server answered: headers and JSON into values, problems into our errors; touches no network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import httpx2
+
+from straightpcf.clients.sdk.retry import Failure
+from straightpcf.points.errors import (
+    ERRORS_BY_CODE,
+    ConnectionFailed,
+    InternalError,
+    InvalidRequest,
+    ServerBusy,
+    StraightPCFError,
+    TooManyBytes,
+)
+
+__all__ = ["Health", "ServerInfo", "failed_connection", "failed_response", "parse_health", "parse_info"]
+
+# A request that may have reached the server is sent again only because denoising is idempotent.
+# Not in the list: a timeout while waiting for the result, which the next attempt would only meet again.
+_RETRYABLE_FAULTS = (
+    httpx2.ConnectError,
+    httpx2.ConnectTimeout,
+    httpx2.ReadError,
+    httpx2.WriteError,
+    httpx2.RemoteProtocolError,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """Tell whether the server is there, and whether a worker is warm."""
+
+    status: str
+    ready: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerInfo:
+    """Tell what a server is and takes; formats by name."""
+
+    version: str
+    model: str
+    weights: str
+    devices: tuple[str, ...]
+    max_bytes: int
+    max_points: int
+    max_jobs: int
+    max_iterations: int
+    formats: tuple[str, ...]
+
+
+def parse_health(response: httpx2.Response) -> Health:
+    """Read GET /healthz."""
+    body = response.json()
+    return Health(status=body["status"], ready=body["ready"])
+
+
+def parse_info(response: httpx2.Response) -> ServerInfo:
+    """Read GET /v1/info; what a newer server adds is left out."""
+    body = response.json()
+    plain = ("version", "model", "weights", "max_bytes", "max_points", "max_jobs", "max_iterations")
+    return ServerInfo(
+        **{name: body[name] for name in plain},
+        devices=tuple(body["devices"]),
+        formats=tuple(entry["name"] for entry in body["formats"]),
+    )
+
+
+def failed_response(response: httpx2.Response) -> Failure:
+    """Turn an error response, its body read, into the error that has its code."""
+    problem = _problem(response)
+    request_id = problem.get("request_id") or response.headers.get("X-Request-Id")
+    kind = ERRORS_BY_CODE.get(str(problem.get("code")), _kind_of_status(response.status_code))
+    detail = str(problem.get("detail") or f"HTTP {response.status_code} {response.reason_phrase}")
+    return Failure(
+        error=kind(detail, request_id=request_id),
+        retryable=bool(problem.get("retryable", response.status_code in (429, 503))),
+        retry_after=_seconds(response.headers),
+    )
+
+
+def failed_connection(fault: httpx2.TransportError, url: object) -> Failure:
+    """Turn what the network did into our error."""
+    error = ConnectionFailed(f"{url}: {type(fault).__name__}: {fault}")
+    return Failure(error=error, retryable=isinstance(fault, _RETRYABLE_FAULTS), cause=fault)
+
+
+def _problem(response: httpx2.Response) -> dict[str, Any]:
+    try:
+        body = response.json()
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        return {}  # a proxy in between answers in HTML
+    return body if isinstance(body, dict) else {}
+
+
+def _kind_of_status(status: int) -> type[StraightPCFError]:
+    if status == 413:
+        return TooManyBytes
+    if status in (429, 503):
+        return ServerBusy
+    return InvalidRequest if 400 <= status < 500 else InternalError
+
+
+def _seconds(headers: Mapping[str, str]) -> float | None:
+    try:
+        return max(0.0, float(headers.get("Retry-After", "")))
+    except ValueError:
+        return None  # absent, or a date: the usual backoff will do

@@ -1,0 +1,161 @@
+"""One request body, from the socket to a file: never whole in memory, never a byte over the limit."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import Request
+
+from straightpcf.points.errors import InvalidRequest
+from straightpcf.service.engine import Limits
+
+__all__ = ["Upload", "check_declared_size", "receive_upload"]
+
+FILE_FIELD = "file"
+MAX_FIELDS = 20
+MAX_FIELD_BYTES = 1024
+WRITE_BYTES = 2**20
+
+
+@dataclass
+class Upload:
+    """Hold what came with one file: its name, if it has one, and the form's other fields."""
+
+    name: str | None = None
+    fields: dict[str, str] = field(default_factory=dict)
+
+
+def check_declared_size(request: Request, limits: Limits) -> None:
+    """Refuse a body by its Content-Length, before a byte of it is read."""
+    if (declared := request.headers.get("content-length", "")).isdigit():
+        limits.check_bytes(int(declared))
+
+
+async def receive_upload(request: Request, target: Path, *, limits: Limits) -> Upload:
+    """Write the request's file to `target`: a form's part named "file", or any other body as it is.
+
+    Raises TooManyBytes, InvalidRequest; ClientDisconnect if the client goes away.
+    """
+    kind, parameters = parse_options_header(request.headers.get("content-type"))
+    with await asyncio.to_thread(target.open, "wb") as file:
+        spool = _SpoolFile(file)
+        if kind == b"multipart/form-data":
+            upload = await _receive_form(request, parameters.get(b"boundary", b""), spool, limits)
+        else:
+            upload = await _receive_raw(request, spool, limits)
+        await spool.flush()
+    return upload
+
+
+async def _receive_raw(request: Request, spool: _SpoolFile, limits: Limits) -> Upload:
+    received = 0
+    async for chunk in request.stream():
+        limits.check_bytes(received := received + len(chunk))
+        spool.buffer += chunk
+        await spool.flush(above=WRITE_BYTES)
+    _, options = parse_options_header(request.headers.get("content-disposition"))
+    return Upload(name=_text(options[b"filename"]) if b"filename" in options else None)
+
+
+async def _receive_form(request: Request, boundary: bytes, spool: _SpoolFile, limits: Limits) -> Upload:
+    form = _Form(spool.buffer)
+    received = 0
+    try:
+        parser = MultipartParser(boundary, form.callbacks())
+        async for chunk in request.stream():
+            limits.check_bytes(received := received + len(chunk))
+            parser.write(chunk)
+            await spool.flush(above=WRITE_BYTES)
+    except FormParserError as exc:
+        raise InvalidRequest(f"the form breaks the multipart format: {exc}") from exc
+    if not form.ended:
+        raise InvalidRequest(f"the form ends after {received} bytes without its closing boundary")
+    if not form.has_file:
+        raise InvalidRequest(f'the form has no file in a field named "{FILE_FIELD}"')
+    return form.upload
+
+
+class _SpoolFile:
+    """Gather small pieces and write them in large ones, off the event loop."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.buffer = bytearray()
+
+    async def flush(self, *, above: int = 0) -> None:
+        if len(self.buffer) > above:
+            await asyncio.to_thread(self._file.write, self.buffer)
+            self.buffer.clear()
+
+
+class _Form:
+    """Follow the parser through the parts of one form; the bytes of the file part go to `sink`."""
+
+    def __init__(self, sink: bytearray) -> None:
+        self.upload = Upload()
+        self.has_file = False
+        self.ended = False
+        self._file = sink
+        self._header = (bytearray(), bytearray())
+        self._disposition = b""
+        self._name = ""
+        self._sink = bytearray()
+
+    def callbacks(self) -> Any:
+        return {
+            "on_part_begin": self._on_part_begin,
+            "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
+            "on_header_value": lambda data, start, end: self._header[1].extend(data[start:end]),
+            "on_header_end": self._on_header_end,
+            "on_headers_finished": self._on_headers_finished,
+            "on_part_data": self._on_part_data,
+            "on_part_end": self._on_part_end,
+            "on_end": self._on_end,
+        }
+
+    def _on_part_begin(self) -> None:
+        self._disposition = b""
+
+    def _on_header_end(self) -> None:
+        name, value = self._header
+        if name.lower() == b"content-disposition":
+            self._disposition = bytes(value)
+        self._header = (bytearray(), bytearray())
+
+    def _on_headers_finished(self) -> None:
+        _, options = parse_options_header(self._disposition)
+        self._name = _text(options.get(b"name", b""))
+        if self._name == FILE_FIELD:
+            if self.has_file:
+                raise InvalidRequest(f'the form has more than one file in "{FILE_FIELD}"; send one cloud a request')
+            self.has_file = True
+            self.upload.name = _text(options[b"filename"]) if b"filename" in options else None
+            self._sink = self._file
+        else:
+            self._sink = bytearray()
+
+    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
+        self._sink += data[start:end]
+        if self._sink is not self._file and len(self._sink) > MAX_FIELD_BYTES:
+            raise InvalidRequest(
+                f"form field {self._name[:40]!r} has more than {MAX_FIELD_BYTES} bytes; "
+                f'the cloud belongs in the field "{FILE_FIELD}"'
+            )
+
+    def _on_part_end(self) -> None:
+        if self._sink is not self._file:
+            self.upload.fields[self._name] = _text(self._sink)
+            if len(self.upload.fields) > MAX_FIELDS:
+                raise InvalidRequest(f"the form has more than {MAX_FIELDS} fields")
+
+    def _on_end(self) -> None:
+        self.ended = True
+
+
+def _text(data: bytes | bytearray) -> str:
+    return bytes(data).decode("utf-8", errors="replace")

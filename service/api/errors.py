@@ -1,0 +1,95 @@
+"""Every error as application/problem+json (RFC 9457); the one table from code to HTTP status."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError
+from straightpcf.service.api.request_id import HEADER, request_id
+from straightpcf.service.api.schemas import Problem
+
+__all__ = ["PROBLEM_MEDIA_TYPE", "RETRY_AFTER_SECONDS", "STATUS_BY_CODE", "install_error_handlers"]
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER_SECONDS = 2
+
+STATUS_BY_CODE: Mapping[str, int] = {
+    "error": 500,
+    "invalid_request": 400,
+    "invalid_options": 422,
+    "unknown_format": 415,
+    "missing_dependency": 415,  # what is missing is the reader of this media type
+    "invalid_cloud": 422,
+    "malformed_file": 422,
+    "too_few_points": 422,
+    "unsupported_cloud": 422,
+    "too_large": 413,
+    "too_many_points": 413,
+    "too_many_bytes": 413,
+    "device_unavailable": 503,
+    "server_busy": 503,
+    "job_canceled": 409,
+    "internal_error": 500,
+    "connection_failed": 502,
+}
+
+
+def install_error_handlers(app: FastAPI) -> None:
+    """Answer every exception of an app, whoever raised it, with a problem."""
+    app.add_exception_handler(StraightPCFError, _ours)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(RequestValidationError, _validation)
+    app.add_exception_handler(ClientDisconnect, _nobody_listens)
+    app.add_exception_handler(Exception, _unforeseen)
+
+
+async def _ours(request: Request, error: Exception) -> Response:
+    assert isinstance(error, StraightPCFError)
+    return _problem(request, error, STATUS_BY_CODE[error.code])
+
+
+async def _http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    path = f"{request.method} {request.url.path[:200]}"
+    kind = InvalidRequest if error.status_code < 500 else InternalError
+    return _problem(request, kind(f"{error.detail}: {path}"), error.status_code, headers=error.headers)
+
+
+async def _validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    faults = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
+    return _problem(request, InvalidRequest(faults), 422)
+
+
+async def _nobody_listens(request: Request, error: Exception) -> Response:
+    return Response(status_code=400)
+
+
+async def _unforeseen(request: Request, error: Exception) -> Response:
+    # Its message may hold paths or contents: the log has it, under this request's id.
+    return _problem(request, InternalError("the server met an error of its own"), 500)
+
+
+def _problem(
+    request: Request, error: StraightPCFError, status: int, *, headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    problem = Problem(
+        type=f"urn:straightpcf:error:{error.code}",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=error.message,
+        code=error.code,
+        retryable=error.retryable,
+        request_id=request_id(request),
+    )
+    own = {HEADER: request_id(request)} | ({"Retry-After": str(RETRY_AFTER_SECONDS)} if error.retryable else {})
+    return JSONResponse(
+        problem.model_dump(), status_code=status, media_type=PROBLEM_MEDIA_TYPE, headers={**(headers or {}), **own}
+    )

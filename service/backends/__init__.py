@@ -1,0 +1,1 @@
+"""Where clouds are computed: the protocol (`base`) and one process per device on this machine (`local`)."""

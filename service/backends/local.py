@@ -1,0 +1,111 @@
+"""One spawned process per device on this machine; a dead one is replaced and its job run once more."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from straightpcf.points.errors import InternalError, StraightPCFError
+from straightpcf.service.backends.base import FileJob, FileReport
+from straightpcf.service.backends.process import WorkerDied, WorkerProcess
+from straightpcf.service.backends.worker import WorkerSpec
+
+__all__ = ["LocalBackend"]
+
+ATTEMPTS = 2
+FIRST_RESTART_DELAY_SECONDS = 0.5
+MAX_RESTART_DELAY_SECONDS = 30.0
+STOP_PATIENCE_SECONDS = 5.0
+
+logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
+
+
+class LocalBackend:
+    """Keep one worker alive for every spec and give each job, in order of arrival, to the first that is idle.
+
+    on_failure: called once if a worker says that it can never start (no such device, no such weights).
+    """
+
+    def __init__(self, specs: list[WorkerSpec], *, on_failure: Callable[[], None] = lambda: None) -> None:
+        self._specs = specs
+        self.on_failure = on_failure
+        self._failure: StraightPCFError | None = None
+        self._idle: asyncio.Queue[WorkerProcess | None] = asyncio.Queue()  # None: look at the failure
+        self._turn = asyncio.Lock()  # fair, where a queue lets a newcomer overtake
+        self._keepers: list[asyncio.Task[None]] = []
+        self._warm: dict[WorkerProcess, str] = {}
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Name the device of every worker that is warm."""
+        return tuple(self._warm.values())
+
+    @property
+    def failure(self) -> StraightPCFError | None:
+        """Say why no job will ever run here."""
+        return self._failure
+
+    async def start(self) -> None:
+        """Begin to start one worker per spec."""
+        self._keepers = [asyncio.create_task(self._keep(spec)) for spec in self._specs]
+
+    async def stop(self) -> None:
+        """End every worker; jobs must have been cancelled before."""
+        for keeper in self._keepers:
+            keeper.cancel()
+        await asyncio.gather(*self._keepers, return_exceptions=True)
+
+    async def run(
+        self, job: FileJob, *, on_start: Callable[[], None], on_progress: Callable[[float], None]
+    ) -> FileReport:
+        """Run a job, a second time if its worker dies; raises its error, or InternalError after the second death."""
+        for attempt in range(1, ATTEMPTS + 1):
+            worker = await self._claim()
+            on_start()
+            try:
+                return await worker.run(job, on_progress=on_progress)
+            except WorkerDied as death:
+                logger.warning("%s (attempt %d of %d)", death, attempt, ATTEMPTS)
+            finally:
+                if worker.alive:
+                    self._idle.put_nowait(worker)
+        raise InternalError(f"the worker died {ATTEMPTS} times on this cloud, which was then given up")
+
+    async def _claim(self) -> WorkerProcess:
+        async with self._turn:
+            while True:
+                worker = await self._idle.get()
+                if worker is None:
+                    self._idle.put_nowait(None)
+                    raise self._failure or InternalError("no worker")
+                if worker.alive:
+                    return worker
+
+    async def _keep(self, spec: WorkerSpec) -> None:
+        """Keep one worker alive, waiting longer after each one that died before it was ready."""
+        delay = FIRST_RESTART_DELAY_SECONDS
+        while self._failure is None:
+            worker = WorkerProcess(spec)
+            try:
+                self._warm[worker] = await asyncio.shield(worker.ready)
+                self._idle.put_nowait(worker)
+                logger.info("worker %s is ready on %s", worker.pid, self._warm[worker])
+                delay = FIRST_RESTART_DELAY_SECONDS
+                await asyncio.shield(worker.died)
+                logger.warning("worker %s died; starting another", worker.pid)
+            except WorkerDied as death:
+                logger.warning("%s; starting another in %g s", death, delay)
+                await asyncio.sleep(delay)
+                delay = min(2 * delay, MAX_RESTART_DELAY_SECONDS)
+            except StraightPCFError as error:
+                self._fail(error)
+            finally:
+                self._warm.pop(worker, None)
+                await worker.stop(patience_seconds=STOP_PATIENCE_SECONDS)
+
+    def _fail(self, error: StraightPCFError) -> None:
+        logger.error("no worker can start: %s", error)
+        self._failure = error
+        self._idle.put_nowait(None)
+        self.on_failure()

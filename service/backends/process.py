@@ -1,0 +1,119 @@
+"""The server's end of one worker process: start it, hand it a job, notice when it dies."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+from collections.abc import Callable
+from typing import Any
+
+from straightpcf.points.errors import ERRORS_BY_CODE, InternalError
+from straightpcf.service.backends.base import FileJob, FileReport
+from straightpcf.service.backends.worker import Cancel, Done, Failed, Progress, Ready, WorkerSpec, run_worker
+
+__all__ = ["WorkerDied", "WorkerProcess"]
+
+_SPAWN = multiprocessing.get_context("spawn")  # a forked CUDA context is broken, and a fork copies our sockets
+
+
+class WorkerDied(Exception):  # noqa: N818 - an event, never shown to a user
+    """Report a worker that ended without an answer (killed, out of memory, a crash in native code)."""
+
+
+class WorkerProcess:
+    """Own one child process and its pipe; every method runs on the event loop and none of them blocks it."""
+
+    def __init__(self, spec: WorkerSpec) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._pipe, theirs = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(
+            target=run_worker, args=(theirs, spec), daemon=True, name=f"straightpcf-worker-{spec.device}"
+        )
+        self._process.start()
+        theirs.close()
+        self._loop.add_reader(self._pipe.fileno(), self._read)
+        self.ready: asyncio.Future[str] = self._loop.create_future()
+        self.died: asyncio.Future[None] = self._loop.create_future()
+        self._job: FileJob | None = None
+        self._answer: asyncio.Future[FileReport] | None = None
+        self._on_progress: Callable[[float], None] | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Tell whether jobs may still be handed over."""
+        return not self.died.done()
+
+    @property
+    def pid(self) -> int | None:
+        """Name the process."""
+        return self._process.pid
+
+    async def run(self, job: FileJob, *, on_progress: Callable[[float], None]) -> FileReport:
+        """Run one job at a time; raises its error, or WorkerDied. When cancelled, wait until the worker has let go."""
+        answer: asyncio.Future[FileReport] = self._loop.create_future()
+        self._job, self._answer, self._on_progress = job, answer, on_progress
+        try:
+            self._send(job)
+            return await asyncio.shield(answer)
+        except asyncio.CancelledError:
+            self._send(Cancel(job.id))
+            await asyncio.wait([answer])
+            answer.exception()  # seen: nobody wants it any more
+            raise
+        finally:
+            if not answer.done():  # cancelled twice: this worker is of no use until it ends
+                answer.cancel()
+                self._process.kill()
+            self._job = self._answer = self._on_progress = None
+
+    async def stop(self, *, patience_seconds: float) -> None:
+        """Ask the process to end, and make it after a while; reaps it."""
+        self._send(None)
+        await asyncio.to_thread(self._process.join, patience_seconds)
+        if self._process.is_alive():
+            self._process.kill()
+            await asyncio.to_thread(self._process.join)
+        self._bury()
+
+    def _send(self, message: Any) -> None:
+        if not self.alive:
+            return
+        try:
+            self._pipe.send(message)
+        except OSError:
+            self._bury()
+
+    def _read(self) -> None:
+        try:
+            while self.alive and self._pipe.poll():
+                self._take(self._pipe.recv())
+        except (EOFError, OSError):
+            self._bury()
+
+    def _take(self, message: Any) -> None:
+        match message:
+            case Ready(device):
+                self.ready.set_result(device)
+            case Failed(None, code, text):
+                self.ready.set_exception(ERRORS_BY_CODE.get(code, InternalError)(text))
+            case Progress(job_id, fraction) if self._concerns(job_id) and self._on_progress is not None:
+                self._on_progress(fraction)
+            case Done(job_id, report) if self._concerns(job_id) and self._answer is not None:
+                self._answer.set_result(report)
+            case Failed(job_id, code, text) if self._concerns(job_id) and self._answer is not None:
+                self._answer.set_exception(ERRORS_BY_CODE.get(code, InternalError)(text))
+
+    def _concerns(self, job_id: str | None) -> bool:
+        return self._job is not None and self._job.id == job_id and self._answer is not None and not self._answer.done()
+
+    def _bury(self) -> None:
+        if not self.alive:
+            return
+        self._loop.remove_reader(self._pipe.fileno())
+        self._pipe.close()
+        self._process.kill()  # its end of the pipe may be gone while it is not
+        self.died.set_result(None)
+        if not self.ready.done():
+            self.ready.set_exception(WorkerDied(f"worker {self.pid} ended before it was ready"))
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(WorkerDied(f"worker {self.pid} ended during job {self._job}"))

@@ -1,0 +1,135 @@
+"""The worker process: load the model once, then denoise files as they are asked for."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
+from straightpcf.service.backends.base import FileJob, FileReport
+from straightpcf.service.backends.denoise_file import denoise_file
+
+if TYPE_CHECKING:
+    from straightpcf.model.filter import Filter
+
+__all__ = ["Cancel", "Done", "Failed", "Progress", "Ready", "WorkerSpec", "run_worker"]
+
+PROGRESS_INTERVAL_SECONDS = 0.05
+WARM_UP_POINTS = 1200  # more than a patch, so that the usual path is the one that is warm
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerSpec:
+    """Say what a worker computes with."""
+
+    device: str
+    weights: Path | None
+    threads: int | None
+
+
+# What crosses the pipe. To the worker: FileJob, Cancel, None to end. From it: the other four.
+@dataclass(frozen=True)
+class Cancel:
+    """Ask the worker to drop a job at its next patch."""
+
+    job_id: str
+
+
+@dataclass(frozen=True)
+class Ready:
+    """Tell that the model is loaded and one cloud went through it."""
+
+    device: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Tell the share of a job that is done, 0..1."""
+
+    job_id: str
+    fraction: float
+
+
+@dataclass(frozen=True)
+class Done:
+    """Tell that a job's target file is complete."""
+
+    job_id: str
+    report: FileReport
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Tell why a job, or with job_id None the start, failed; the code names the class."""
+
+    job_id: str | None
+    code: str
+    message: str
+
+
+def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
+    """Serve jobs until the pipe says None or its other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the server says when to end
+    try:
+        denoiser = _load(spec)
+    except StraightPCFError as error:
+        pipe.send(Failed(None, error.code, error.message))
+        return
+    except OSError as error:  # no such weights
+        pipe.send(Failed(None, InternalError.code, str(error)))
+        return
+    pipe.send(Ready(denoiser.device))
+    try:
+        while (job := pipe.recv()) is not None:
+            if isinstance(job, FileJob):  # a Cancel that comes after its job has ended means nothing
+                pipe.send(_answer(denoiser, job, pipe))
+    except (EOFError, BrokenPipeError):
+        return  # the server is gone, and so is who would want the result
+
+
+def _load(spec: WorkerSpec) -> Filter:
+    import numpy as np
+
+    from straightpcf.model.filter import load_filter
+
+    denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads)
+    directions = np.random.default_rng(0).normal(size=(WARM_UP_POINTS, 3))
+    denoiser.denoise(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    return denoiser
+
+
+def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
+    sent = 0.0
+
+    def on_progress(fraction: float) -> None:
+        nonlocal sent
+        while pipe.poll():
+            message = pipe.recv()
+            if message is None or message == Cancel(job.id):
+                raise JobCanceled(f"job {job.id} was canceled")
+        if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS:
+            sent = now
+            pipe.send(Progress(job.id, fraction))
+
+    try:
+        return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress))
+    except (EOFError, BrokenPipeError):
+        raise
+    except Exception as error:
+        return _failure(job.id, error)
+
+
+def _failure(job_id: str, error: Exception) -> Failed:
+    if isinstance(error, StraightPCFError):
+        return Failed(job_id, error.code, error.message)
+    logger.exception("the worker met an error of no kind of ours")
+    if isinstance(error, MemoryError):
+        return Failed(job_id, TooLarge.code, "the cloud does not fit in this server's memory")
+    return Failed(job_id, InternalError.code, f"the worker failed with {type(error).__name__}")
