@@ -1,0 +1,199 @@
+"""Print CD and P2M (x 1e4) per shape and on average, beside the noisy input and the paper's rows.
+
+python -m benchmarks.quality --split punet --resolution 10000 --noise 0.01 0.02 0.03
+python -m benchmarks.quality --split validation
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
+from straightpcf.model.checkpoint import load_official_checkpoint
+from straightpcf.model.filter import Filter, load_filter
+from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
+from straightpcf.model.nets.straightpcf import VelocityModule
+from straightpcf.points.options import DenoiseOptions
+
+Floats = npt.NDArray[np.float64]
+Run = Callable[[Floats, float], tuple[Floats, int]]  # cloud, noise level -> cloud, passes
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+PAPER_ROWS = ("Score", "PDFlow", "DeepPSR", "IterativePFN", "StraightPCF")
+OFFICIAL_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Row:
+    """One shape at one noise level; distances x 1e4."""
+
+    shape: str
+    resolution: int
+    noise: float
+    noisy_cd: float
+    noisy_p2m: float
+    cd: float
+    p2m: float
+    iterations: int
+    seconds: float
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    options = _parser().parse_args(arguments)
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    run = _runner(options)
+    rows = []
+    for resolution in options.resolution:
+        for noise in options.noise:
+            cell = []
+            print(f"\n{options.split}, {resolution} points, {options.noise_type} noise {noise:g}, {options.model}")
+            print(f"{'shape':14s} {'noisy CD':>9s} {'P2M':>8s}  {'CD':>9s} {'P2M':>8s}  passes  seconds")
+            for shape in _shapes(options, resolution):
+                cell.append(_measure(shape, resolution, noise, options, run))
+                _print(cell[-1])
+            _summary(cell, resolution, noise, options)
+            rows += cell
+            if options.json:
+                options.json.parent.mkdir(parents=True, exist_ok=True)
+                options.json.write_text(json.dumps(_record(options, rows), indent=1) + "\n")
+
+
+def _measure(shape: Shape, resolution: int, noise: float, options: argparse.Namespace, run: Run) -> Row:
+    made = options.noise_type != "gaussian" or noise not in shape.noisy
+    noisy = make_noise(options.noise_type, shape.clean, noise, options.seed) if made else shape.noisy[noise]
+    began = time.perf_counter()
+    denoised, iterations = run(noisy, noise)
+    seconds = time.perf_counter() - began
+    before = _distances(noisy, shape)
+    after = before if denoised is noisy else _distances(denoised, shape)
+    return Row(shape.name, resolution, noise, *before, *after, iterations, seconds)
+
+
+def _distances(cloud: Floats, shape: Shape) -> tuple[float, float]:
+    cd, p2m = chamfer_distance(cloud, shape.clean), point_to_mesh_distance(cloud, shape.vertices, shape.faces)
+    return 1e4 * cd, 1e4 * p2m
+
+
+def _shapes(options: argparse.Namespace, resolution: int) -> list[Shape]:
+    if options.split == "validation":
+        return analytic(resolution, options.shapes)
+    if not (options.data / "punet_test.npz").is_file():
+        raise SystemExit(f"{options.data} has no punet_test.npz; `--split validation` needs no data")
+    return punet(options.data, resolution, options.shapes)
+
+
+def _runner(options: argparse.Namespace) -> Run:
+    if options.model == "noisy":
+        return lambda cloud, _: (cloud, 0)
+    if options.model == "official":
+        module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
+        if not isinstance(module, VelocityModule):
+            raise SystemExit("--model official takes the authors' single VelocityModule")
+        model = Filter(_VelocityOnly(module), threads=options.threads)  # type: ignore[arg-type]
+    else:
+        model = load_filter(options.weights, device=options.device, threads=options.threads)
+
+    def run(cloud: Floats, noise: float) -> tuple[Floats, int]:
+        passes = options.iterations
+        if passes == "auto" and options.model == "official":
+            passes = str(max(1, round(100 * noise)))  # it has no DistanceModule: the paper's rule, told the noise
+        result = model.denoise(cloud, DenoiseOptions.parse(iterations=passes, seed=str(options.seed)))
+        return result.xyz, result.iterations
+
+    return run
+
+
+class _VelocityOnly(nn.Module):
+    """A lone VelocityModule behind the interface of StraightPCF: the distance is 1, four Euler steps."""
+
+    def __init__(self, module: VelocityModule) -> None:
+        super().__init__()
+        self.module = module
+
+    def distance_module(self, x: torch.Tensor) -> torch.Tensor:
+        return x.new_ones(len(x), 1)
+
+    def forward(self, x: torch.Tensor, *, euler_steps: int) -> tuple[torch.Tensor, torch.Tensor]:
+        del euler_steps  # the filter's default is that of the whole network
+        for _ in range(OFFICIAL_STEPS):
+            x = x + self.module(x) / OFFICIAL_STEPS
+        return x, x.new_ones(len(x), 1)
+
+
+def _print(row: Row) -> None:
+    figures = f"{row.noisy_cd:9.3f} {row.noisy_p2m:8.3f}  {row.cd:9.3f} {row.p2m:8.3f}"
+    print(f"{row.shape:14s} {figures}  {row.iterations:6d}  {row.seconds:7.2f}", flush=True)
+
+
+def _summary(rows: list[Row], resolution: int, noise: float, options: argparse.Namespace) -> None:
+    before = np.mean([(row.noisy_cd, row.noisy_p2m) for row in rows], axis=0)
+    after = np.mean([(row.cd, row.p2m) for row in rows], axis=0)
+    less = 100 * (1 - after / before)
+    passes = np.bincount([row.iterations for row in rows])
+    chosen = ", ".join(f"{count} x {n}" for n, count in enumerate(passes) if count)
+    seconds = np.mean([row.seconds for row in rows])
+    print(f"{'mean':14s} {before[0]:9.3f} {before[1]:8.3f}  {after[0]:9.3f} {after[1]:8.3f}          {seconds:7.2f}")
+    print(f"less than the noisy input: CD {less[0]:.1f} %, P2M {less[1]:.1f} %; passes (shapes x passes): {chosen}")
+    worse = [row.shape for row in rows if row.cd > row.noisy_cd or row.p2m > row.noisy_p2m]
+    if worse:
+        print(f"WORSE than the noisy input: {', '.join(worse)}")
+    for name, cd, p2m in _paper(resolution, noise, options):
+        print(f"  paper, {name:13s} {'':12s} {cd:9.3f} {p2m:8.3f}")
+
+
+def _paper(resolution: int, noise: float, options: argparse.Namespace) -> list[tuple[str, float, float]]:
+    """Return the published rows of this cell, as long as all 20 shapes were measured and the file is here."""
+    path = options.data.parent / "reference" / "paper_results.json"
+    if options.split != "punet" or options.shapes or not path.is_file():
+        return []
+    table: dict[str, Any] = json.loads(path.read_text()).get(options.noise_type, {}).get("PUNet", {})
+    cell = f"{resolution // 1000}K/{round(100 * noise)}%"
+    return [
+        (name, table[name][f"{cell}/CD"], table[name][f"{cell}/P2M"])
+        for name in PAPER_ROWS
+        if f"{cell}/CD" in table.get(name, {}) and np.isclose(noise, round(100 * noise) / 100)
+    ]
+
+
+def _record(options: argparse.Namespace, rows: list[Row]) -> dict[str, Any]:
+    said = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    return {"options": said, "rows": [asdict(row) for row in rows]}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.quality",
+        description=(__doc__ or "").splitlines()[0],
+        epilog=f"Shapes of the validation split: {', '.join(ANALYTIC)}.",
+    )
+    parser.add_argument("--split", choices=("punet", "validation"), default="punet")
+    parser.add_argument("--resolution", type=int, nargs="+", default=[10000])
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.01, 0.02, 0.03], help="in unit-sphere radii")
+    parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
+    parser.add_argument("--iterations", default="auto", help='"auto" or a number of passes')
+    parser.add_argument("--shapes", nargs="+", help="only these")
+    parser.add_argument("--model", choices=("ours", "official", "noisy"), default="ours")
+    parser.add_argument("--weights", type=Path, help="the shipped ones, or the authors' with --model official")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--threads", type=int, help="CPU threads, all by default")
+    parser.add_argument("--seed", type=int, default=0, help="of made noise and of the filter")
+    parser.add_argument("--data", type=Path, default=SHARED / "data")
+    parser.add_argument("--json", type=Path, help="write every row there, after each cell")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
