@@ -23,7 +23,7 @@ from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches
 from straightpcf.points.errors import DeviceUnavailable, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "denoise", "load_filter"]
+__all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
 
 DEFAULT_WEIGHTS = Path(__file__).with_name("weights") / "straightpcf.safetensors"
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
@@ -53,13 +53,15 @@ class DenoiseResult:
     """The filtered cloud and how it came about.
 
     xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
-    untouched: rows that were not finite and passed through.
+    distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not
+    finite and passed through.
     """
 
     xyz: npt.NDArray[np.float64]
     iterations: int
     noise_before: float
     noise_after: float
+    distances: tuple[float, ...]
     untouched: int
     seconds: float
     warnings: tuple[str, ...]
@@ -120,7 +122,7 @@ class Filter:
 
         Raises TooFewPoints below MIN_POINTS finite rows.
         """
-        run = _Run(self, xyz, options or DenoiseOptions())
+        run = Run(self, xyz, options or DenoiseOptions())
         began = time.monotonic()
         for patch in run.patches():
             if on_progress is not None:
@@ -134,10 +136,10 @@ class Filter:
 
         Rows that are not finite belong to no patch. Order and batching never change a position.
         """
-        return _Run(self, xyz, options or DenoiseOptions()).patches()
+        return Run(self, xyz, options or DenoiseOptions()).patches()
 
 
-class _Run:
+class Run:
     """One cloud on its way through the filter."""
 
     def __init__(self, owner: Filter, xyz: npt.NDArray[np.float64], options: DenoiseOptions) -> None:
@@ -149,15 +151,17 @@ class _Run:
             untouched = len(xyz) - len(self.rows)
             raise TooFewPoints(f"{len(self.rows)} points to filter ({untouched} not finite); at least {MIN_POINTS}")
         self.frame = CloudFrame.of(xyz[self.rows])
+        self.points = _Distinct(xyz[self.rows])
         self.iterations = 0
-        self.moved = np.zeros((len(self.rows), 3))  # in the unit-ball frame
+        self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.noise = [0.0, 0.0]
+        self.distances: list[float] = []
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
         if self.frame.radius == 0.0:
             return
-        start = self.frame.enter(self.xyz[self.rows])
+        start = self.frame.enter(self.points.xyz)
         planned = None if self.options.iterations == "auto" else self.options.iterations
         with ThreadPoolExecutor(self.filter.threads, initializer=_one_thread) as pool:
             while True:
@@ -175,18 +179,20 @@ class _Run:
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
         out = self.xyz.copy()
-        out[self.rows] += self.options.strength * self.frame.radius * self.moved
+        out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
         warnings = [f"{untouched} points are not finite and were passed through"] if untouched else []
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
         before, after = (self.frame.radius * noise for noise in self.noise)
-        return DenoiseResult(out, self.iterations, before, after, untouched, seconds, tuple(warnings))
+        return DenoiseResult(
+            out, self.iterations, before, after, tuple(self.distances), untouched, seconds, tuple(warnings)
+        )
 
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
-        return self.filter.calibration.passes_left(self.distance, done=self.iterations)
+        return self.filter.calibration.passes_left(self.distances[-1], done=self.iterations)
 
     def _pass(
         self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor, left: int
@@ -196,11 +202,14 @@ class _Run:
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for n, (patch, displacement) in enumerate(self._displacements(here, cut, scales, pool), start=1):
             rows = cut.owned_rows(patch)
-            indices = cut.index[patch][rows]
-            self.moved[indices] += displacement[rows] / scales[patch]
-            xyz = self.xyz[self.rows[indices]] + self.options.strength * self.frame.radius * self.moved[indices]
+            owned = cut.index[patch][rows]
+            self.moved[owned] += displacement[rows] / scales[patch]
+            copies = self.points.copies(owned)
+            indices = self.rows[copies]
+            moved = self.moved[self.points.inverse[copies]]
+            xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
             progress = (done_before + n / len(cut.seeds)) * share
-            yield FinishedPatch(self.rows[indices], xyz, self.iterations, left == 1, progress)
+            yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
 
     def _displacements(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
@@ -214,7 +223,8 @@ class _Run:
             return (moved - x).double().cpu().numpy()  # type: ignore[no-any-return]
 
         starts = range(0, len(cut.seeds), step)
-        for first, displacements in zip(starts, _bounded_map(pool, move, starts, 2 * self.filter.threads), strict=True):
+        results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
+        for first, displacements in zip(starts, results, strict=True):
             yield from enumerate(displacements, start=first)
 
     def _tensor(
@@ -234,8 +244,30 @@ class _Run:
                 return float(self.filter.network.distance_module(self._tensor(here, cut, scales, [patch])))
 
         distances = np.array(list(pool.map(read, probes)))
-        self.distance = float(np.median(distances))
+        self.distances.append(float(np.median(distances)))
         return float(np.median(self.filter.calibration.noise_std(distances) / scales[probes]))
+
+
+class _Distinct:
+    """The distinct positions of a cloud; points in one place (a depth camera's zeros) move together.
+
+    xyz: (U, 3) float64; inverse: (N,) the distinct row of each point. Without duplicates both keep the order.
+    """
+
+    def __init__(self, xyz: npt.NDArray[np.float64]) -> None:
+        unique, inverse = np.unique(xyz, axis=0, return_inverse=True)
+        self.repeated = len(unique) < len(xyz)
+        self.xyz = unique if self.repeated else xyz
+        self.inverse = inverse.reshape(-1) if self.repeated else np.arange(len(xyz))
+        if self.repeated:
+            self._order = np.argsort(self.inverse, kind="stable")
+            self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(unique) + 1))
+
+    def copies(self, distinct: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+        """Return the points that lie at some distinct rows."""
+        if not self.repeated:
+            return distinct.astype(np.int64)
+        return np.concatenate([self._order[self._starts[d] : self._starts[d + 1]] for d in distinct] or [distinct])
 
 
 def _one_thread() -> None:

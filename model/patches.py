@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 __all__ = ["PATCH_SIZE", "Patches", "cut_patches"]
 
 PATCH_SIZE = 1000
-# Farthest-point sampling is exact and cheap up to this many points; larger clouds are sampled bucket by bucket.
-_BUCKET_HEIGHT = 7
+_TREE_HEIGHT = 7  # of the sampler's buckets; their number may not pass the number of points
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,8 @@ def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, pat
         more = left[_farthest(xyz[left], max(1, int(np.ceil(2 * len(left) / size))), 0)]
         more_distance, more_index = _nearest(tree, xyz[more], size)
         # Among equal points the tree may leave out the seed itself; it must be in its own patch.
-        more_index[~(more_index == more[:, None]).any(axis=1), -1] = more[~(more_index == more[:, None]).any(axis=1)]
+        absent = ~(more_index == more[:, None]).any(axis=1)
+        more_index[absent, -1] = more[absent]
         covered[more_index] = True
         seeds = np.concatenate([seeds, more])
         distance, index = np.concatenate([distance, more_distance]), np.concatenate([index, more_index])
@@ -67,9 +67,9 @@ def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDAr
         return np.arange(len(xyz), dtype=np.int64)
     if wanted == 1:
         return np.array([first], dtype=np.int64)
-    return np.asarray(
-        fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), wanted, _BUCKET_HEIGHT, first), dtype=np.int64
-    )
+    height = min(_TREE_HEIGHT, len(xyz).bit_length() - 1)
+    seeds = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), wanted, height, first)
+    return np.asarray(seeds, dtype=np.int64)
 
 
 def _nearest(

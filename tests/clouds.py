@@ -1,0 +1,37 @@
+"""Clouds on analytic surfaces, so that no test needs data."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["distance_to_torus", "noisy", "sphere", "torus"]
+
+_RING, _TUBE = 0.7, 0.3
+
+
+def torus(count: int, seed: int = 0) -> npt.NDArray[np.float64]:
+    """Sample (count, 3) float64 points of a torus around z inside the unit ball, nearly evenly."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(0, 2 * np.pi, (2, 4 * count + 40))
+    # The outer side has more area: keep a point in proportion to it.
+    kept = rng.uniform(0, _RING + _TUBE, len(v)) < _RING + _TUBE * np.cos(v)
+    u, v = u[kept][:count], v[kept][:count]
+    ring = _RING + _TUBE * np.cos(v)
+    return np.stack([ring * np.cos(u), ring * np.sin(u), _TUBE * np.sin(v)], axis=1)
+
+
+def distance_to_torus(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return (N,) exact distances from `torus`."""
+    return np.abs(np.hypot(np.hypot(xyz[:, 0], xyz[:, 1]) - _RING, xyz[:, 2]) - _TUBE)
+
+
+def sphere(count: int, seed: int = 0) -> npt.NDArray[np.float64]:
+    """Sample (count, 3) float64 points of the unit sphere."""
+    xyz = np.random.default_rng(seed).standard_normal((count, 3))
+    return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+
+
+def noisy(xyz: npt.NDArray[np.float64], noise_std: float, seed: int = 1) -> npt.NDArray[np.float64]:
+    """Add Gaussian noise of `noise_std`, in the cloud's unit."""
+    return xyz + noise_std * np.random.default_rng(seed).standard_normal(xyz.shape)

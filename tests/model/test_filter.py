@@ -1,0 +1,153 @@
+"""The contracts of DESIGN.md: same points, same order, big coordinates, any size, same bytes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import distance_to_torus, noisy, sphere, torus
+
+ONE_PASS = DenoiseOptions(iterations=1)
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Filter:
+    return load_filter(device="cpu")
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Filter:
+    """An untrained narrow network: enough for everything but quality, and fast."""
+    torch.manual_seed(0)
+    return Filter(StraightPCF(width=128, distance_width=128), threads=2, coverage=2)
+
+
+def test_noise_shrinks_on_a_torus(shipped: Filter) -> None:
+    cloud = noisy(torus(5000), 0.02)
+    result = shipped.denoise(cloud)
+    before, after = (np.square(distance_to_torus(x)).mean() for x in (cloud, result.xyz))
+    assert after < 0.25 * before
+    assert result.noise_after < result.noise_before
+
+
+def test_a_clean_sphere_hardly_moves(shipped: Filter) -> None:
+    cloud = sphere(4000)
+    moved = np.linalg.norm(shipped.denoise(cloud).xyz - cloud, axis=1)
+    assert np.median(moved) < 0.02
+
+
+def test_the_result_moves_and_scales_and_shifts_with_the_cloud(shipped: Filter) -> None:
+    """A similarity of the input is the same similarity of the output, up to what rotation the network learnt."""
+    cloud = noisy(torus(3000), 0.01)
+    straight = shipped.denoise(cloud, ONE_PASS).xyz
+    shifted = shipped.denoise(cloud * 250 + [5e5, 4e6, 300], ONE_PASS).xyz
+    np.testing.assert_allclose((shifted - [5e5, 4e6, 300]) / 250, straight, atol=2e-3)
+    rotation = Rotation.from_euler("xyz", [0.4, 1.1, -0.7]).as_matrix()
+    turned = shipped.denoise(cloud @ rotation, ONE_PASS).xyz @ rotation.T
+    assert np.linalg.norm(turned - straight, axis=1).mean() < 0.5 * np.linalg.norm(cloud - straight, axis=1).mean()
+
+
+@settings(max_examples=5, deadline=None)
+@given(count=st.integers(MIN_POINTS, 2500), holes=st.integers(0, 20), seed=st.integers(0, 1000))
+def test_row_i_stays_row_i_and_invalid_rows_pass_through(tiny: Filter, count: int, holes: int, seed: int) -> None:
+    cloud = noisy(torus(count, seed), 0.01)
+    where = np.random.default_rng(seed).integers(0, count + 1, holes)
+    cloud = np.insert(cloud, where, [[np.nan, 1, np.inf]], axis=0)
+    result = tiny.denoise(cloud, ONE_PASS)
+    assert result.xyz.shape == cloud.shape
+    invalid = ~np.isfinite(cloud).all(axis=1)
+    np.testing.assert_array_equal(result.xyz[invalid], cloud[invalid])
+    assert np.isfinite(result.xyz[~invalid]).all()
+    assert np.linalg.norm(result.xyz[~invalid] - cloud[~invalid], axis=1).max() < 1.0
+    assert result.untouched == holes
+
+
+def test_patches_add_up_to_the_result_whatever_the_thread_count(tiny: Filter) -> None:
+    cloud = noisy(torus(3500), 0.01)
+    options = DenoiseOptions(iterations=2)
+    whole = tiny.denoise(cloud, options)
+    single = Filter(tiny.network, threads=1, coverage=2)
+    stitched, seen = cloud.copy(), []
+    for patch in single.patches(cloud, options):
+        if patch.final:
+            stitched[patch.indices] = patch.xyz
+            seen.append(patch.indices)
+    assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(3500))
+    assert stitched.tobytes() == whole.xyz.tobytes()
+
+
+def test_the_same_request_gives_the_same_bytes(tiny: Filter) -> None:
+    cloud = noisy(torus(2200), 0.01)
+    assert tiny.denoise(cloud).xyz.tobytes() == tiny.denoise(cloud).xyz.tobytes()
+
+
+def test_strength_scales_the_displacement(tiny: Filter) -> None:
+    cloud = noisy(torus(1500), 0.01)
+    full = tiny.denoise(cloud, ONE_PASS).xyz - cloud
+    half = tiny.denoise(cloud, DenoiseOptions(iterations=1, strength=0.5)).xyz - cloud
+    none = tiny.denoise(cloud, DenoiseOptions(iterations=1, strength=0)).xyz
+    np.testing.assert_allclose(half, full / 2, atol=1e-12)
+    assert none.tobytes() == cloud.tobytes()
+
+
+@pytest.mark.parametrize("count", [0, 1, 10, MIN_POINTS - 1])
+def test_too_few_points_are_refused_with_the_limit(tiny: Filter, count: int) -> None:
+    with pytest.raises(TooFewPoints, match=str(MIN_POINTS)):
+        tiny.denoise(torus(count))
+
+
+def test_a_cloud_of_nan_is_refused(tiny: Filter) -> None:
+    with pytest.raises(TooFewPoints, match="not finite"):
+        tiny.denoise(np.full((100, 3), np.nan))
+
+
+def test_equal_points_come_back_as_they_are_with_a_warning(tiny: Filter) -> None:
+    cloud = np.tile([1e7, -3.0, 0.1], (200, 1))
+    result = tiny.denoise(cloud)
+    assert result.xyz.tobytes() == cloud.tobytes()
+    assert "coincide" in result.warnings[0]
+
+
+def test_points_in_one_place_move_together_and_cost_no_patches(tiny: Filter) -> None:
+    """A depth camera writes its invalid pixels as zeros: thousands of equal points."""
+    cloud = np.concatenate([noisy(torus(1500), 0.01), np.zeros((6000, 3))])
+    patches = list(tiny.patches(cloud, ONE_PASS))
+    assert len(patches) < 10
+    assert sum(len(patch.indices) for patch in patches) == 7500
+    moved = tiny.denoise(cloud, ONE_PASS).xyz[1500:]
+    assert (moved == moved[0]).all()
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e300])
+def test_extreme_units_are_filtered_like_any_other(tiny: Filter, scale: float) -> None:
+    cloud = noisy(torus(600), 0.01)
+    expected = tiny.denoise(cloud, ONE_PASS).xyz
+    np.testing.assert_allclose(tiny.denoise(cloud * scale, ONE_PASS).xyz / scale, expected, atol=1e-3)
+
+
+def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> None:
+    seen: list[float] = []
+
+    def stop(progress: float) -> None:
+        seen.append(progress)
+        if len(seen) == 3:
+            raise JobCanceled("enough")
+
+    with pytest.raises(JobCanceled):
+        tiny.denoise(noisy(torus(5000), 0.01), DenoiseOptions(iterations=3), on_progress=stop)
+    assert seen == sorted(seen)
+    assert len(seen) == 3
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_device_that_is_not_here_is_named() -> None:
+    with pytest.raises(DeviceUnavailable, match="cuda"):
+        load_filter(device="cuda")

@@ -1,0 +1,53 @@
+"""The network is the paper's."""
+
+from __future__ import annotations
+
+import torch
+
+from straightpcf.model.nets.edgeconv import EdgeConv
+from straightpcf.model.nets.straightpcf import DistanceModule, StraightPCF, VelocityModule
+from straightpcf.model.ops import knn
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def test_parameter_counts_are_the_papers() -> None:
+    assert parameters(VelocityModule()) == 234_947
+    assert parameters(StraightPCF()) == 533_415
+
+
+def test_an_edgeconv_equals_its_definition_on_explicit_edges() -> None:
+    torch.manual_seed(0)
+    block, x = EdgeConv(16, 32), torch.randn(1, 60, 16)
+    index = knn(x, 8)
+    neighbours = x[0][index[0].long()]  # (P, k, C)
+    centre = x[0][:, None].expand_as(neighbours)
+    edges = block.mlp(torch.cat([centre, neighbours - centre], dim=2)).amax(dim=1)
+    expected = torch.relu(edges) + torch.relu(block.lin(x[0]))
+    torch.testing.assert_close(block(x, index)[0], expected, atol=2e-2, rtol=2e-2)  # bfloat16 products
+
+
+def test_velocities_do_not_depend_on_the_order_of_the_points() -> None:
+    torch.manual_seed(0)
+    module, x = VelocityModule().eval(), torch.randn(1, 300, 3) * 0.2
+    order = torch.randperm(300)
+    with torch.inference_mode():
+        torch.testing.assert_close(module(x[:, order]), module(x)[:, order], atol=1e-5, rtol=1e-4)
+
+
+def test_the_first_rows_alone_give_what_all_rows_give() -> None:
+    torch.manual_seed(0)
+    module, x = VelocityModule().eval(), torch.randn(2, 300, 3) * 0.2
+    with torch.inference_mode():
+        torch.testing.assert_close(module(x, 40), module(x)[:, :40])
+
+
+def test_the_distance_lies_between_0_and_1_and_does_not_see_the_scale() -> None:
+    torch.manual_seed(0)
+    module, x = DistanceModule().eval(), torch.randn(2, 300, 3)
+    with torch.inference_mode():
+        small, large = module(x * 1e-3), module(x * 1e3)
+    assert ((small > 0) & (small < 1)).all()
+    torch.testing.assert_close(small, large, atol=1e-3, rtol=1e-3)

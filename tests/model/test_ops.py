@@ -1,0 +1,77 @@
+"""The compiled loops and their plain torch twins compute the same function."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from straightpcf.model import ops
+from straightpcf.model.kernels import cpu
+
+kernels = pytest.mark.skipif(cpu.load() is None, reason="no C++ compiler and no shipped kernels")
+
+
+def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a - b).norm() / b.norm())
+
+
+@kernels
+@pytest.mark.parametrize(("count", "dims"), [(1000, 3), (1000, 64), (333, 32), (34, 16)])
+def test_knn_finds_the_same_neighbours_as_topk(count: int, dims: int) -> None:
+    x = torch.randn(2, count, dims, generator=torch.Generator().manual_seed(count))
+    found = ops.knn(x, 32).sort().values
+    expected = ops.knn_torch(x, 32, count).sort().values
+    assert (found == expected).float().mean() > 0.999  # ties at float32 rounding may differ
+
+
+@kernels
+def test_knn_never_returns_the_point_itself() -> None:
+    index = ops.knn(torch.randn(1, 500, 3), 32)
+    assert not (index == torch.arange(500)[:, None]).any()
+
+
+@pytest.mark.parametrize("count", [2, 20, 33])
+def test_knn_repeats_neighbours_when_there_are_too_few(count: int) -> None:
+    x = torch.randn(1, count, 3)
+    for index in (ops.knn(x, 32), ops.knn_torch(x, 32, count)):
+        assert index.shape == (1, count, 32)
+        assert {len(set(row.tolist())) for row in index[0]} == {min(32, count - 1)}
+
+
+@kernels
+def test_knn_of_equal_points_stays_in_range() -> None:
+    index = ops.knn(torch.zeros(1, 200, 3), 32)
+    assert index.min() >= 0
+    assert index.max() < 200
+
+
+@kernels
+@pytest.mark.parametrize(("width", "out_width"), [(16, 16), (32, 32), (64, 64), (128, 128), (256, 256)])
+def test_edge_max_agrees_with_the_gathered_form(width: int, out_width: int) -> None:
+    generator = torch.Generator().manual_seed(width)
+    a, b = torch.randn(2, 2, 200, width, generator=generator)
+    weight = torch.randn(out_width, width, generator=generator) / width**0.5
+    index = ops.knn(b, 32, 70)
+    found = ops.edge_max(a[:, :70], b, index, weight)
+    expected = ops.edge_max_torch(a[:, :70].double(), b.double(), index, weight.double())
+    assert relative_error(found, expected) < 5e-3  # bfloat16 products where the processor has them
+
+
+@kernels
+def test_edge_max_gradient_is_exact_along_the_winning_edges() -> None:
+    """With weights and inputs on a coarse grid bfloat16 is exact, so the winners and the gradient must agree."""
+    generator = torch.Generator().manual_seed(0)
+
+    def grid(*shape: int) -> torch.Tensor:
+        return (torch.randint(-8, 9, shape, generator=generator) / 8).requires_grad_()
+
+    a, b, weight = grid(1, 50, 32), grid(1, 120, 32), grid(32, 32)
+    index = ops.knn(b, 8, 50)
+    # Ties share no gradient the same way: break them with a gradient that is zero where they are.
+    hidden = torch.relu(a.unsqueeze(2) + b[0][index.long()])
+    top = (hidden @ weight.T).topk(2, dim=2).values
+    grad = torch.randn(1, 50, 32, generator=generator) * (top[:, :, 0] > top[:, :, 1])
+    found = torch.autograd.grad(ops.edge_max(a, b, index, weight), (a, b, weight), grad)
+    expected = torch.autograd.grad(ops.edge_max_torch(a, b, index, weight), (a, b, weight), grad)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert relative_error(ours, theirs) < 1e-5

@@ -1,0 +1,83 @@
+"""Three stages run, resume where they stopped, and give the same weights for the same seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from straightpcf.model.train import train
+from straightpcf.model.train.data import PATCH_SIZE, PatchSource
+from straightpcf.model.train.state import read_network
+from straightpcf.points.errors import InvalidOptions
+from tests.clouds import sphere, torus
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "shapes.npz"
+    clouds = {f"shape{i:02d}/2000": (torus(2000, i) if i % 2 else sphere(2000, i)) for i in range(11)}
+    np.savez(path, **{name: cloud.astype(np.float32) for name, cloud in clouds.items()})
+    return path
+
+
+@pytest.fixture(scope="module")
+def velocity_run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train("vm", data=data, run_dir=tmp_path_factory.mktemp("vm"), iterations=3, batch_size=2, threads=1)
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return read_network(path)[0].state_dict()
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_training_shapes_and_validation_shapes_are_disjoint(data: Path) -> None:
+    parts = [PatchSource.read(data, validation=v) for v in (False, True)]
+    clouds = [{cloud.tobytes() for cloud in part._clouds} for part in parts]
+    assert len(clouds[0]) + len(clouds[1]) == 11
+    assert not clouds[0] & clouds[1]
+    assert clouds[1]
+
+
+def test_a_batch_is_noisy_clean_pairs_around_its_seeds(data: Path) -> None:
+    batch = PatchSource.read(data).draw(np.random.default_rng(0), 4)
+    assert batch.noisy.shape == batch.clean.shape == (4, PATCH_SIZE, 3)
+    std = (batch.noisy - batch.clean).std(dim=(1, 2))
+    assert ((std > 0.015) & (std < 0.025)).all()  # 0.02, scaled by 0.8 to 1.2
+    assert (batch.at(batch.time).norm(dim=2).amin(dim=1) < 1e-5).all()  # the seed is in its patch, at the origin
+
+
+def test_the_same_seed_gives_the_same_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:
+    again = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1)
+    assert same(weights(again), weights(velocity_run))
+
+
+def test_a_later_stage_asks_for_the_one_before(data: Path, tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptions, match="init"):
+        train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1)
+
+
+def test_the_stages_follow_each_other_and_freeze_what_they_should(
+    data: Path, tmp_path: Path, velocity_run: Path
+) -> None:
+    coupled = train(
+        "cvm", data=data, run_dir=tmp_path / "cvm", iterations=2, batch_size=2, threads=1, init=velocity_run
+    )
+    full = train("dm", data=data, run_dir=tmp_path / "dm", iterations=2, batch_size=2, threads=1, init=coupled)
+    before, after = weights(coupled), weights(full)
+    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert moved == {"distance_module"}
+
+
+def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> None:
+    seen: list[int] = []
+    for iterations in (2, 4):
+        train("vm", data=data, run_dir=tmp_path, iterations=iterations, batch_size=2, threads=1,
+              on_step=lambda step: seen.append(step.iteration))  # fmt: skip
+    assert seen == [1, 2, 3, 4]
+    assert (tmp_path / "log.csv").read_text().count("stage") == 1
