@@ -1,0 +1,135 @@
+"""Time this project's filter beside the authors' way to compute, same weights, same cloud, same run.
+
+    python -m benchmarks.speed
+    python -m benchmarks.speed --resolution 10000 --patches all
+
+Each side runs in a process of its own, so that its peak memory is its own. The authors' scheme is
+`benchmarks.reference`: it is timed on a sample of its patches and extrapolated unless `--patches all`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import multiprocessing
+import os
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.quality import SHARED
+from benchmarks.shapes import Shape, analytic, make_noise, punet
+
+NOISE = 0.02
+SAMPLE = 16
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What one side took: seconds, patches computed of those it has, peak resident MiB, and its result."""
+
+    seconds: float
+    patches: str
+    peak_mib: float
+    xyz: npt.NDArray[np.float64] | None
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    options = _parser().parse_args(arguments)
+    print(f"{os.cpu_count()} CPUs, {options.threads} threads, {options.iterations} passes, noise {NOISE:g}")
+    for resolution in options.resolution:
+        shape = _shape(options, resolution)
+        noisy = shape.noisy.get(NOISE)
+        noisy = make_noise("gaussian", shape.clean, NOISE, 0) if noisy is None else noisy
+        print(f"\n{shape.name}, {resolution} points {'seconds':>9s} {'peak MiB':>9s} {'CD':>8s} {'P2M':>8s}  patches")
+        _print("noisy input", None, noisy, shape)
+        ours = _alone(_ours, noisy, options)
+        _print("this project", ours, ours.xyz, shape)
+        theirs = _alone(_reference, noisy, options)
+        _print("authors' scheme", theirs, theirs.xyz, shape)
+        print(f"ratio {theirs.seconds / ours.seconds:.1f}")
+
+
+def _ours(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+    from straightpcf.model.filter import load_filter
+    from straightpcf.points.options import DenoiseOptions
+
+    model = load_filter(options.weights, device="cpu", threads=options.threads)
+    wanted = DenoiseOptions(iterations=options.iterations)
+    model.denoise(noisy[:2000], wanted)  # what is compiled or loaded once is not the cloud's
+    began = time.perf_counter()
+    result = model.denoise(noisy, wanted)
+    return Timing(time.perf_counter() - began, f"all, {model.coverage:g}-fold", _peak(), result.xyz)
+
+
+def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+    import torch
+
+    from benchmarks import reference
+    from straightpcf.model.allocator import keep_large_buffers
+    from straightpcf.model.checkpoint import architecture_of, read_checkpoint
+    from straightpcf.model.filter import DEFAULT_WEIGHTS
+
+    torch.set_num_threads(options.threads)
+    keep_large_buffers()  # the comparison is of schemes, not of allocators
+    state, _ = read_checkpoint(options.weights or DEFAULT_WEIGHTS)
+    move = reference.straightpcf(state, couplings=architecture_of(state)["couplings"])
+    result = reference.denoise(noisy, move, passes=options.iterations, batch=1, sample=options.patches)
+    whole = result.timed_patches == result.patches
+    extrapolated = "all" if whole else f"{result.timed_patches} of {result.patches}, EXTRAPOLATED"
+    return Timing(result.seconds, f"{extrapolated}, 6-fold", _peak(), result.xyz if whole else None)
+
+
+def _alone(side: Any, noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+    """Call one side in a fresh process."""
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(1) as pool:
+        return pool.apply(functools.partial(side, noisy, options))
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _print(name: str, timing: Timing | None, xyz: npt.NDArray[np.float64] | None, shape: Shape) -> None:
+    from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
+
+    took = f"{timing.seconds:9.2f} {timing.peak_mib:9.0f}" if timing else " " * 19
+    quality = f"{'-':>8s} {'-':>8s}"
+    if xyz is not None:
+        p2m = point_to_mesh_distance(xyz, shape.vertices, shape.faces)
+        quality = f"{1e4 * chamfer_distance(xyz, shape.clean):8.3f} {1e4 * p2m:8.3f}"
+    print(f"{name:18s} {took} {quality}  {timing.patches if timing else ''}", flush=True)
+
+
+def _shape(options: argparse.Namespace, resolution: int) -> Shape:
+    if options.shape in (None, "cow") and (options.data / "punet_test.npz").is_file():
+        return punet(options.data, resolution, ["cow"])[0]
+    return analytic(resolution, [options.shape or "torus"])[0]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--resolution", type=int, nargs="+", default=[10000, 50000])
+    parser.add_argument("--iterations", type=int, default=1, help="passes of both")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument(
+        "--patches",
+        type=lambda text: None if text == "all" else int(text),
+        default=SAMPLE,
+        help=f'patches on which the authors\' scheme is timed, or "all" (default {SAMPLE})',
+    )
+    parser.add_argument("--shape", help="cow where PUNet is at hand (the default), or an analytic shape")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--data", type=Path, default=SHARED / "data")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
