@@ -124,7 +124,7 @@ def _move(
 ) -> torch.Tensor:
     moved = []
     with torch.inference_mode():
-        for some in members.split(batch):
+        for some in torch.split(members, batch):
             seed = cloud[some[:, :1]]
             moved.append(move(cloud[some] - seed) + seed)
     return torch.cat(moved)
@@ -175,5 +175,5 @@ def _decode(state: State, features: torch.Tensor, *, pool: bool) -> torch.Tensor
         norm = part(state, f"decoder.bn_{layer}_out.")
         h = linear(h, state[f"decoder.lin_{layer}.weight"], state[f"decoder.lin_{layer}.bias"])
         h = torch.relu(batch_norm(h, norm["running_mean"], norm["running_var"], norm["weight"], norm["bias"]))
-    h = h.unflatten(0, features.shape[:2])
+    h = h.view(*features.shape[:2], -1)
     return linear(h.amax(dim=1) if pool else h, state["decoder.lin_3.weight"], state["decoder.lin_3.bias"])

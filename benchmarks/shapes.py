@@ -98,13 +98,14 @@ def _spread(points: Floats, count: int) -> Floats:
     """Thin out to `count` points that keep their distance, as a Poisson sampling does."""
     import fpsample
 
-    return points[np.asarray(fpsample.bucket_fps_kdline_sampling(points.astype(np.float32), count, 7, 0), dtype=int)]
+    chosen = fpsample.bucket_fps_kdline_sampling(points.astype(np.float32), count, 7, 0)
+    return np.asarray(points[np.asarray(chosen, dtype=np.int64)])
 
 
 def _grid(rows: int, columns: int, *, round_rows: bool = False, round_columns: bool = False) -> Faces:
     """Triangulate a rows x columns grid of vertices, closed in the directions that go round."""
-    i, j = np.meshgrid(np.arange(rows - (not round_rows)), np.arange(columns - (not round_columns)), indexing="ij")
-    i, j = i.ravel(), j.ravel()
+    grid = np.meshgrid(np.arange(rows - (not round_rows)), np.arange(columns - (not round_columns)), indexing="ij")
+    i, j = grid[0].ravel(), grid[1].ravel()
     below, right = (i + 1) % rows, (j + 1) % columns
     a, b, c, d = i * columns + j, below * columns + j, below * columns + right, i * columns + right
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])

@@ -10,14 +10,13 @@ Each side runs in a process of its own, so that its peak memory is its own. The 
 from __future__ import annotations
 
 import argparse
-import functools
 import multiprocessing
 import os
 import resource
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +36,9 @@ class Timing:
     patches: str
     peak_mib: float
     xyz: npt.NDArray[np.float64] | None
+
+
+Side = Callable[[npt.NDArray[np.float64], argparse.Namespace], Timing]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -86,11 +88,11 @@ def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> T
     return Timing(result.seconds, f"{extrapolated}, 6-fold", _peak(), result.xyz if whole else None)
 
 
-def _alone(side: Any, noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+def _alone(side: Side, noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
     """Call one side in a fresh process."""
     context = multiprocessing.get_context("spawn")
     with context.Pool(1) as pool:
-        return pool.apply(functools.partial(side, noisy, options))
+        return pool.apply(side, (noisy, options))
 
 
 def _peak() -> float:
