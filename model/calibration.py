@@ -16,7 +16,7 @@ __all__ = ["Calibration"]
 
 @dataclass(frozen=True)
 class Calibration:
-    """The table and the limits that `auto` uses; measured by `straightpcf.model.train.calibrate`, kept with the weights.
+    """The table and the limits that `auto` uses; measured by `model.train.calibrate`, kept with the weights.
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
     one_pass: d up to which one pass is enough; stop: d below which a cloud counts as clean after a pass.
@@ -41,8 +41,9 @@ class Calibration:
         if entry is None:
             return cls()
         try:
-            return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
-        except TypeError as exc:
+            values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in entry.items()}
+            return cls(**values)
+        except (AttributeError, TypeError) as exc:
             raise MalformedFile(f"the weights' calibration does not fit: {exc}") from exc
 
     def to_metadata(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, patch_scales
-from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches
+from straightpcf.model.patches import Patches, cut_patches
 from straightpcf.points.errors import DeviceUnavailable, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 
@@ -84,7 +84,9 @@ def load_filter(weights: Path | None = None, *, device: str = "auto", threads: i
     return Filter(network, calibration=calibration, device=chosen, threads=threads)
 
 
-def denoise(xyz: npt.ArrayLike, *, iterations: int | str = "auto", seed: int = 0, device: str = "auto") -> DenoiseResult:
+def denoise(
+    xyz: npt.ArrayLike, *, iterations: int | str = "auto", seed: int = 0, device: str = "auto"
+) -> DenoiseResult:
     """Filter (N, 3) points with the shipped weights: `load_filter` and `Filter.denoise` in one call."""
     options = DenoiseOptions.parse(iterations=str(iterations), seed=str(seed))
     return load_filter(device=device).denoise(np.asarray(xyz, dtype=np.float64), options)
@@ -129,9 +131,7 @@ class Filter:
                 on_progress(patch.progress)
         return run.result(time.monotonic() - began)
 
-    def patches(
-        self, xyz: npt.NDArray[np.float64], options: DenoiseOptions | None = None
-    ) -> Iterator[FinishedPatch]:
+    def patches(self, xyz: npt.NDArray[np.float64], options: DenoiseOptions | None = None) -> Iterator[FinishedPatch]:
         """Yield patches of (N, 3) points as they are settled; those with `final` add up to the result.
 
         Rows that are not finite belong to no patch. Order and batching never change a position.
@@ -267,7 +267,8 @@ class _Distinct:
         """Return the points that lie at some distinct rows."""
         if not self.repeated:
             return distinct.astype(np.int64)
-        return np.concatenate([self._order[self._starts[d] : self._starts[d + 1]] for d in distinct] or [distinct])
+        groups = [self._order[self._starts[d] : self._starts[d + 1]] for d in distinct]
+        return np.concatenate(groups) if groups else distinct.astype(np.int64)
 
 
 def _one_thread() -> None:

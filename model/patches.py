@@ -79,9 +79,7 @@ def _nearest(
     return distance.astype(np.float32), index.astype(np.int32)
 
 
-def _owners(
-    distance: npt.NDArray[np.float32], index: npt.NDArray[np.int32], count: int
-) -> npt.NDArray[np.int32]:
+def _owners(distance: npt.NDArray[np.float32], index: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:
     radius = distance[:, -1:]
     relative = distance / np.where(radius > 0, radius, 1)
     best = np.full(count, np.inf, dtype=np.float32)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["EdgeMax", "build", "instruction_set", "knn", "load"]
+__all__ = ["EdgeMax", "build", "build_all", "instruction_set", "knn", "load"]
 
 _SOURCE = Path(__file__).with_name("edgeconv.cpp")
 _SHIPPED = Path(__file__).with_name("lib")
@@ -62,16 +62,20 @@ def load() -> ctypes.CDLL | None:
         return None
 
 
-def build(folder: Path) -> Path:
-    """Compile for this processor into `folder`; raise OSError or SubprocessError where that fails."""
+def build(folder: Path, target_set: str | None = None) -> Path:
+    """Compile for an instruction set (this processor's by default) into `folder`.
+
+    Raises OSError or SubprocessError where that fails.
+    """
+    target_set = target_set or instruction_set()
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         raise OSError("no C++ compiler: install g++")
     folder.mkdir(parents=True, exist_ok=True)
-    target = folder / _file_name()
+    target = folder / _file_name(target_set)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         built = Path(scratch) / "kernel.so"
-        flags = [*_FLAGS.split(), *_INSTRUCTION_SETS[instruction_set()].split()]
+        flags = [*_FLAGS.split(), *_INSTRUCTION_SETS[target_set].split()]
         command = [compiler, *flags, str(_SOURCE), "-o", str(built)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_SECONDS, check=False)
         if done.returncode != 0:
@@ -85,10 +89,14 @@ def _cache() -> Path:
     return Path(root) / "straightpcf"
 
 
-@functools.cache
-def _file_name() -> str:
+def build_all(folder: Path) -> list[Path]:
+    """Compile for every instruction set, as an image does that does not know where it will run."""
+    return [build(folder, name) for name in _INSTRUCTION_SETS]
+
+
+def _file_name(target_set: str | None = None) -> str:
     digest = hashlib.sha256(_SOURCE.read_bytes() + _FLAGS.encode()).hexdigest()[:12]
-    return f"edgeconv-{platform.machine()}-{instruction_set()}-{digest}.so"
+    return f"edgeconv-{platform.machine()}-{target_set or instruction_set()}-{digest}.so"
 
 
 def _open(path: Path) -> ctypes.CDLL:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import nn
 
@@ -23,10 +25,10 @@ class EdgeConv(nn.Module):
 
     def forward(self, x: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
         """Map x (B, P, C) to (B, M, D) for the M points whose neighbours `index` (B, M, k) holds."""
-        first, second = self.mlp[0], self.mlp[2]
+        first, second = cast(nn.Linear, self.mlp[0]), cast(nn.Linear, self.mlp[2])
         rows = x[:, : index.shape[1]]
         # [x_i, x_j - x_i] W = x_i (W_a - W_b) + x_j W_b: the first layer runs per point, not per edge.
-        own, other = first.weight.split(x.shape[2], dim=1)
+        own, other = first.weight[:, : x.shape[2]], first.weight[:, x.shape[2] :]
         a = nn.functional.linear(rows, own - other, first.bias)
         b = nn.functional.linear(x, other)
         edges = edge_max(a, b, index, second.weight) + second.bias

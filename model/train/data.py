@@ -82,10 +82,10 @@ class PatchSource:
         if augment:
             transform = Rotation.random(random_state=rng).as_matrix() * rng.uniform(*SCALES)
         inside = rng.permutation(inside)
-        return (noisy[inside] - origin) @ transform, (clean[inside] - origin) @ transform, np.float64(time)
+        return (noisy[inside] - origin) @ transform, (clean[inside] - origin) @ transform, np.array(time)
 
 
 def _normalised(cloud: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     xyz = cloud.astype(np.float64)
     xyz -= (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    return xyz / np.linalg.norm(xyz, axis=1).max()
+    return xyz / float(np.linalg.norm(xyz, axis=1).max())

@@ -160,5 +160,5 @@ def _validate(stage: Stage, network: StraightPCF, average: Average, fixed: Batch
     averaged = copy.deepcopy(network)
     averaged.load_state_dict(average.tensors)
     averaged.eval()
-    parts = zip(fixed.noisy.split(8), fixed.clean.split(8), fixed.time.split(8), strict=True)
+    parts = zip(*(tensor.chunk(8) for tensor in (fixed.noisy, fixed.clean, fixed.time)), strict=True)
     return round(float(np.mean([_LOSSES[stage](averaged, Batch(*part), rows).item() for part in parts])), 5)

@@ -50,7 +50,7 @@ def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor
     for k, velocity in enumerate(network.velocity_modules, start=1):
         v = velocity(x, rows if k == couplings else None)
         x = x[:, : v.shape[1]] + distance / couplings * v
-    return loss + LAMBDA_2 * _UNIT * _squared(x - batch.clean[:, : x.shape[1]])
+    return torch.add(loss, LAMBDA_2 * _UNIT * _squared(x - batch.clean[:, : x.shape[1]]))
 
 
 def _squared(error: torch.Tensor) -> torch.Tensor:

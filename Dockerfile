@@ -1,0 +1,43 @@
+# docker build -t straightpcf .                                   CPU
+# docker build -t straightpcf --build-arg TORCH=cuda .            CUDA (run with --gpus all)
+ARG PYTHON=3.11
+
+FROM python:${PYTHON}-slim AS build
+ARG TORCH=cpu
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends g++ \
+    && rm -rf /var/lib/apt/lists/*
+RUN python -m venv /venv
+# The public index serves CUDA builds of torch, PyTorch's own the CPU build.
+RUN if [ "$TORCH" = cpu ]; then \
+        /venv/bin/pip install --no-cache-dir "torch>=2.6,<2.14" --index-url https://download.pytorch.org/whl/cpu; \
+    fi
+WORKDIR /source
+COPY pyproject.toml README.md ./
+COPY src src
+COPY points points
+COPY model model
+COPY service service
+COPY clients clients
+# The image does not know its processor: carry the kernels for each instruction set.
+RUN /venv/bin/pip install --no-cache-dir ".[service,las]" \
+    && /venv/bin/python -c "from pathlib import Path; from straightpcf.model.kernels import cpu; cpu.build_all(Path(cpu.__file__).with_name('lib'))"
+
+FROM python:${PYTHON}-slim
+LABEL org.opencontainers.image.title="straightpcf" \
+      org.opencontainers.image.description="Point-cloud denoising as a service" \
+      org.opencontainers.image.licenses="MIT"
+RUN useradd --create-home --uid 10001 straightpcf \
+    && install -d -o straightpcf /data
+COPY --from=build /venv /venv
+USER straightpcf
+ENV PATH=/venv/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    STRAIGHTPCF_DATA_DIR=/data
+VOLUME /data
+EXPOSE 8000
+HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
+    CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/readyz', timeout=2)"]
+ENTRYPOINT ["straightpcf"]
+CMD ["serve", "--host", "0.0.0.0", "--port", "8000"]

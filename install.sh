@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# Install straightpcf and everything its tests need into .venv, on a fresh Debian or Ubuntu.
+# PYTHON=python3.12 picks another interpreter; STRAIGHTPCF_TORCH=cuda|cpu overrides what is detected.
+set -euo pipefail
+cd "$(dirname "$0")"
+
+need=(g++ curl)                       # g++ compiles the CPU kernels at first use; the tests call curl
+${PYTHON:-python3} -c 'import venv, ensurepip' 2>/dev/null || need+=(python3-venv)
+missing=()
+for package in "${need[@]}"; do
+  dpkg -s "$package" >/dev/null 2>&1 || missing+=("$package")
+done
+if ((${#missing[@]})); then
+  sudo=""; [ "$(id -u)" = 0 ] || sudo=sudo
+  $sudo apt-get update -q
+  $sudo apt-get install -q -y --no-install-recommends "${missing[@]}"
+fi
+
+[ -x .venv/bin/python ] || ${PYTHON:-python3} -m venv .venv
+torch=${STRAIGHTPCF_TORCH:-$(command -v nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)}
+if [ "$torch" = cpu ] && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
+  # The public index serves CUDA builds of torch; PyTorch's own serves the CPU build. Where that one cannot be
+  # reached, the index in use decides.
+  .venv/bin/pip install -q --retries 0 --timeout 10 'torch>=2.6,<2.14' \
+    --index-url https://download.pytorch.org/whl/cpu 2>/dev/null || true
+fi
+.venv/bin/pip install -q -e '.[dev]'
+.venv/bin/straightpcf version
