@@ -1,0 +1,140 @@
+"""The command line, as its users start it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import straightpcf
+from straightpcf.clients.cli import EXIT_CODES, app, exit_code
+from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import clean_environment
+
+POINTS = 1200
+
+
+def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=clean_environment(), timeout=120)
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    np.save(path := tmp_path / "scan.npy", noisy(torus(POINTS), 0.01).astype(np.float32))
+    return path
+
+
+def test_denoise_writes_the_same_points_and_reports_as_json(scan: Path, weights: Path | None) -> None:
+    target = scan.with_name("clean.npy")
+    arguments = [] if weights is None else ["--weights", weights]
+    done = cli("denoise", scan, target, "--iterations", "1", "--device", "cpu", "--json", *arguments)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["points"], report["iterations"], report["format"]) == (POINTS, 1, "npy")
+    result = np.load(target)
+    assert (result.shape, result.dtype) == ((POINTS, 3), np.dtype(np.float32))
+    assert not np.array_equal(result, np.load(scan))
+    assert sorted(path.name for path in scan.parent.iterdir()) == ["clean.npy", "scan.npy"]
+
+
+def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: Path, weights: Path | None) -> None:
+    np.save(few := tmp_path / "few.npy", sphere(5))
+    (target := tmp_path / "clean.npy").write_bytes(b"of old")
+    arguments = [] if weights is None else ["--weights", weights]
+    done = cli("denoise", few, target, *arguments)
+    assert done.returncode == 3
+    assert done.stderr.startswith("error [too_few_points]: ")
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+    assert target.read_bytes() == b"of old"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["denoise", "IN", "OUT.npy", "--iterations", "0"], 2, "error [invalid_options]"),
+        (["denoise", "IN", "OUT.npy", "--device", "tpu"], 2, "tpu"),
+        (["denoise", "IN"], 2, "OUT"),
+        (["denoise", "IN", "OUT.gif"], 3, "error [unknown_format]"),
+        (["denoise", "missing.npy", "OUT.npy"], 3, "missing.npy"),
+        (["denoise", "IN", "no/such/folder/OUT.npy"], 3, "no/such/folder"),
+        (["info", "missing.npy"], 3, "missing.npy"),
+        (["frobnicate"], 2, "frobnicate"),
+    ],
+)
+def test_exit_codes(arguments: list[str], code: int, text: str, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(scan.parent)
+    done = CliRunner().invoke(app, [str(scan) if word == "IN" else word for word in arguments])
+    assert done.exit_code == code, done.output
+    assert text in done.stderr
+
+
+def test_every_error_has_an_exit_code() -> None:
+    codes = {exit_code(kind("x")) for kind in ERRORS_BY_CODE.values()}
+    assert codes <= {2, 3, 4, 5, 70, 130}
+    chosen = (InvalidOptions, DeviceUnavailable, ServerBusy, InternalError)
+    assert [exit_code(kind("x")) for kind in chosen] == [2, 4, 5, 70]
+    assert exit_code(ZeroDivisionError()) == EXIT_CODES[-1][1] == 70
+
+
+def test_a_device_that_is_not_here_is_exit_4(scan: Path) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    done = CliRunner().invoke(app, ["denoise", str(scan), str(scan.with_name("o.npy")), "--device", "cuda"])
+    assert done.exit_code == 4
+    assert "device_unavailable" in done.stderr
+
+
+def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    done = cli("serve", "--port", "0", "--device", "cuda", "--data-dir", tmp_path)
+    assert done.returncode == 4
+    assert "error [device_unavailable]" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
+    (taken := tmp_path / "file").write_bytes(b"")  # no folder: the server ends as soon as it has warned
+    done = cli("serve", "--host", "0.0.0.0", "--port", "0", "--data-dir", taken / "data")
+    assert "WARNING: listening on 0.0.0.0" in done.stderr
+    assert done.returncode != 0
+
+
+def test_info_describes_a_file(scan: Path) -> None:
+    xyz = np.load(scan)
+    xyz[7] = np.nan
+    np.save(scan, xyz)
+    done = CliRunner().invoke(app, ["info", str(scan), "--json"])
+    facts = json.loads(done.stdout)
+    assert (facts["format"], facts["points"], facts["invalid_rows"]) == ("npy", POINTS, 1)
+    np.testing.assert_allclose(facts["min"], np.nanmin(xyz, axis=0))
+    assert "npy" in CliRunner().invoke(app, ["info", str(scan)]).stdout
+
+
+def test_version_starts_without_torch_or_a_server() -> None:
+    done = cli("version")
+    assert done.stdout.strip() == straightpcf.__version__
+    code = "import sys, straightpcf.clients.cli; print({'torch', 'fastapi', 'numpy', 'httpx2'} & set(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert loaded.stdout.strip() == "set()"
+
+
+def test_doctor_tells_what_is_here() -> None:
+    done = CliRunner().invoke(app, ["doctor", "--json"])
+    findings = json.loads(done.stdout)
+    assert {"python", "extras"} <= set(findings)
+    assert done.exit_code == (4 if "problem" in findings else 0)

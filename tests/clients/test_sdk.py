@@ -1,0 +1,231 @@
+"""The SDK against a real server."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.clients import sdk
+from straightpcf.clients.sdk import AsyncClient, Client, retry
+from straightpcf.points.errors import (
+    ConnectionFailed,
+    InternalError,
+    InvalidCloud,
+    InvalidOptions,
+    ServerBusy,
+    TooFewPoints,
+    TooManyBytes,
+    UnknownFormat,
+)
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import RunningServer
+
+POINTS = 1200
+
+
+@pytest.fixture
+def client(server: RunningServer) -> Iterator[Client]:
+    with Client(server.url) as client:
+        yield client
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    np.save(path := tmp_path / "scan.npy", noisy(torus(POINTS), 0.01))
+    return path
+
+
+def test_the_public_names_are_these() -> None:
+    assert sdk.__all__ == ["AsyncClient", "Client", "Denoised", "Health", "ServerInfo"]
+    methods = {name for name in vars(Client) if not name.startswith("_")}
+    assert methods == {"close", "denoise", "health", "info"}
+    assert {name for name in vars(AsyncClient) if not name.startswith("_")} == {"aclose", *methods} - {"close"}
+
+
+def test_the_sdk_imports_neither_torch_nor_a_server() -> None:
+    heavy = "{'torch', 'fastapi', 'uvicorn', 'scipy', 'pydantic', 'open3d', 'plyfile', 'laspy'}"
+    code = f"import sys, straightpcf.clients.sdk; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() in ("[]", "['plyfile']")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_array_comes_back_as_an_array_of_its_dtype_and_frame(client: Client, dtype: Any) -> None:
+    xyz = (noisy(torus(POINTS), 0.01) + np.array([100.0, -50.0, 7.0])).astype(dtype)
+    result = client.denoise(xyz, iterations=1)
+    assert result.xyz.dtype == dtype
+    assert result.xyz.shape == xyz.shape
+    assert np.abs(result.xyz - xyz).max() < 0.5
+    assert (result.points, result.iterations, result.untouched) == (POINTS, 1, 0)
+    assert result.request_id
+
+
+def test_path_bytes_and_array_give_the_same_points(client: Client, scan: Path, tmp_path: Path) -> None:
+    target = tmp_path / "clean.npy"
+    by_path = client.denoise(scan, target, iterations=1)
+    assert by_path.path == target
+    assert by_path.content is None
+    by_bytes = client.denoise(scan.read_bytes(), iterations=1)
+    by_array = client.denoise(np.load(scan), iterations=1)
+    assert target.read_bytes() == by_bytes.content == by_array.content
+    np.testing.assert_array_equal(by_path.xyz, by_array.xyz)
+    assert by_bytes.save(tmp_path / "saved.npy").read_bytes() == by_bytes.content
+
+
+def test_the_suffix_of_the_target_chooses_the_format(client: Client, scan: Path, tmp_path: Path) -> None:
+    result = client.denoise(scan, tmp_path / "clean.xyz", iterations=1)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "clean.xyz"), result.xyz)
+    assert client.denoise(scan, format="xyz", iterations=1).xyz.shape == (POINTS, 3)
+    with pytest.raises(UnknownFormat):
+        client.denoise(scan, tmp_path / "clean.gif")
+
+
+def test_the_async_client_gives_what_the_sync_one_gives(server: RunningServer, scan: Path, tmp_path: Path) -> None:
+    async def both() -> None:
+        async with AsyncClient(server.url) as client:
+            assert (await client.health()).ready
+            assert (await client.info()).version
+            one, two = await asyncio.gather(
+                client.denoise(scan, tmp_path / "clean.npy", iterations=1), client.denoise(np.load(scan), iterations=1)
+            )
+            np.testing.assert_array_equal(one.xyz, two.xyz)
+            with pytest.raises(TooFewPoints):
+                await client.denoise(sphere(5))
+
+    asyncio.run(both())
+    with Client(server.url) as client:
+        assert client.denoise(scan, iterations=1).content == (tmp_path / "clean.npy").read_bytes()
+
+
+def test_an_error_of_the_server_is_raised_as_its_class_with_the_request_id(client: Client, tmp_path: Path) -> None:
+    target = tmp_path / "clean.npy"
+    target.write_bytes(b"of old")
+    with pytest.raises(TooFewPoints) as caught:
+        client.denoise(sphere(5), target)
+    assert caught.value.request_id
+    assert target.read_bytes() == b"of old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_what_can_be_known_here_is_refused_before_anything_is_sent() -> None:
+    with Client("http://127.0.0.1:1") as client:
+        with pytest.raises(InvalidOptions):
+            client.denoise(sphere(100), iterations=0)
+        with pytest.raises(InvalidCloud, match=r"\(3, 100\)"):
+            client.denoise(sphere(100).T)
+        with pytest.raises(FileNotFoundError):
+            client.denoise("no-such-file.ply")
+
+
+def test_a_body_over_the_limit_is_refused_by_its_class(strict_server: RunningServer) -> None:
+    with Client(strict_server.url, max_retries=0) as client, pytest.raises(TooManyBytes):
+        client.denoise(sphere(200_000))
+
+
+def test_info_and_health(client: Client) -> None:
+    info = client.info()
+    assert client.health() == sdk.Health(status="ok", ready=True)
+    assert "ply" in info.formats
+    assert info.devices == ("cpu",)
+
+
+def test_an_open3d_cloud_comes_back_as_one(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """open3d itself is 1.2 GB; this one has its shape."""
+
+    class PointCloud:
+        def __init__(self, other: Any = None) -> None:
+            self.points = None if other is None else other.points
+            self.colors = None if other is None else other.colors
+
+    PointCloud.__module__ = "open3d.cpu.pybind.geometry"
+    fake = ModuleType("open3d")
+    fake.geometry = SimpleNamespace(PointCloud=PointCloud)  # type: ignore[attr-defined]
+    fake.utility = SimpleNamespace(Vector3dVector=np.asarray)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "open3d", fake)
+    cloud = PointCloud()
+    cloud.points, cloud.colors = noisy(sphere(POINTS), 0.01), "red"
+    clean = client.denoise(cloud, iterations=1).to_open3d()
+    assert clean.colors == "red"
+    assert clean.points.shape == (POINTS, 3)
+
+
+@contextmanager
+def answering(*answers: bytes) -> Iterator[tuple[str, list[bytes]]]:
+    """Serve one canned answer a connection; b"" hangs up without one. Collects the requests' heads."""
+    heads: list[bytes] = []
+
+    def run(listener: socket.socket) -> None:
+        for answer in answers:
+            connection, _ = listener.accept()
+            with connection:
+                heads.append(connection.recv(65536))
+                connection.sendall(answer)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=run, args=(listener,), daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", heads
+        thread.join(timeout=5)
+
+
+def canned(status: str, body: str, *headers: str) -> bytes:
+    head = [f"HTTP/1.1 {status}", f"Content-Length: {len(body)}", "Connection: close", *headers]
+    return ("\r\n".join(head) + "\r\n\r\n" + body).encode()
+
+
+HEALTHY = canned("200 OK", '{"status":"ok","ready":true,"new":1}')
+BUSY = canned("503 Service Unavailable", '{"code":"server_busy","detail":"full","retryable":true}', "Retry-After: 0.2")
+
+
+def test_a_busy_server_is_asked_again_after_the_time_it_names() -> None:
+    with answering(BUSY, HEALTHY) as (url, heads), Client(url, api_key="secret") as client:
+        began = time.monotonic()
+        assert client.health().ready
+        assert time.monotonic() - began >= 0.2
+        assert len(heads) == 2
+        assert b"authorization: bearer secret" in heads[0].lower()
+
+
+def test_a_connection_that_breaks_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    with answering(b"", HEALTHY) as (url, heads), Client(url) as client:
+        assert client.health().ready
+        assert len(heads) == 2
+
+
+def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    with answering(BUSY, BUSY) as (url, _), Client(url, max_retries=1) as client, pytest.raises(ServerBusy):
+        client.health()
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    with Client("http://127.0.0.1:1") as client, pytest.raises(ConnectionFailed, match=r"127\.0\.0\.1:1"):
+        client.health()
+
+
+def test_an_error_that_would_only_come_again_is_not_retried() -> None:
+    missing = canned("503 Service Unavailable", '{"code":"device_unavailable","retryable":false}')
+    for answer, kind in ((missing, Exception), (canned("502 Bad Gateway", "<html>proxy</html>"), InternalError)):
+        with answering(answer) as (url, heads), Client(url) as client:
+            with pytest.raises(kind):
+                client.health()
+            assert len(heads) == 1
+
+
+def test_delays_grow_stay_bounded_and_follow_the_server() -> None:
+    failure = retry.Failure(error=ServerBusy("full"), retryable=True)
+    delays = [retry.next_delay(failure, attempt=n, max_retries=9) or 0.0 for n in range(9)]
+    assert delays[0] < delays[2] < delays[4] <= retry.MAX_DELAY_SECONDS * 1.25
+    assert retry.next_delay(failure, attempt=9, max_retries=9) is None
+    told = retry.Failure(error=ServerBusy("full"), retryable=True, retry_after=10_000.0)
+    assert retry.next_delay(told, attempt=0) == retry.MAX_RETRY_AFTER_SECONDS

@@ -1,0 +1,134 @@
+"""Fixtures that more than one package of tests needs: weights, and servers that run as processes of their own."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+START_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class RunningServer:
+    """A `straightpcf serve` process on a free port of its own."""
+
+    url: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    data_dir: Path
+
+    def worker_pid(self) -> int:
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        workers = [pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        assert len(workers) == 1, workers
+        return int(workers[0])
+
+    def wait_until_ready(self) -> None:
+        deadline = time.monotonic() + START_SECONDS
+        while time.monotonic() < deadline:
+            assert self.process.poll() is None, self.log.read_text()
+            if self._status("/readyz") == 200:
+                return
+            time.sleep(0.1)
+        raise AssertionError(f"not ready within {START_SECONDS} s:\n{self.log.read_text()}")
+
+    def spooled_files(self) -> list[Path]:
+        return [path for path in self.data_dir.rglob("*") if path.is_file() and path.name != ".lock"]
+
+    def _status(self, path: str) -> int:
+        try:
+            with urllib.request.urlopen(self.url + path, timeout=5) as response:
+                return int(response.status)
+        except urllib.error.HTTPError as error:
+            error.close()
+            return error.code
+
+
+@contextmanager
+def run_server(folder: Path, weights: Path | None, *arguments: str) -> Iterator[RunningServer]:
+    """Start a server, wait until it listens, and end it politely."""
+    log = folder / "server.log"
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--device", "cpu"]
+    command += ["--data-dir", str(folder / "data"), *arguments]
+    if weights is not None:
+        command += ["--weights", str(weights)]
+    with log.open("wb") as sink:
+        process = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env=clean_environment())
+    try:
+        yield RunningServer(url=_url_in(log, process), process=process, log=log, data_dir=folder / "data")
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise
+
+
+def clean_environment() -> dict[str, str]:
+    """Return the environment without settings that a developer may have."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("STRAIGHTPCF_")}
+
+
+def _url_in(log: Path, process: subprocess.Popen[bytes]) -> str:
+    deadline = time.monotonic() + START_SECONDS
+    while time.monotonic() < deadline:
+        if found := re.search(r"running on (http://\S+)", log.read_text()):
+            return found[1]
+        assert process.poll() is None, log.read_text()
+        time.sleep(0.05)
+    raise AssertionError(f"no address within {START_SECONDS} s:\n{log.read_text()}")
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
+    """The shipped weights; where none are shipped yet, an untrained network, whose results are no use but finite."""
+    from straightpcf.model.filter import DEFAULT_WEIGHTS
+
+    if DEFAULT_WEIGHTS.is_file():
+        return None
+    import torch
+
+    from straightpcf.model.checkpoint import save_checkpoint
+    from straightpcf.model.nets.straightpcf import StraightPCF
+
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    save_checkpoint(StraightPCF(), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def shared_server(tmp_path_factory: pytest.TempPathFactory, weights: Path | None) -> Iterator[RunningServer]:
+    with run_server(tmp_path_factory.mktemp("server"), weights) as server:
+        server.wait_until_ready()
+        yield server
+
+
+@pytest.fixture
+def server(shared_server: RunningServer) -> RunningServer:
+    """A server that is ready, whatever the test before did to it."""
+    shared_server.wait_until_ready()
+    return shared_server
+
+
+@pytest.fixture(scope="session")
+def strict_server(tmp_path_factory: pytest.TempPathFactory, weights: Path | None) -> Iterator[RunningServer]:
+    """A server with small limits: 100,000 bytes, 4,000 points, one request at a time."""
+    limits = ("--max-bytes", "100000", "--max-points", "4000", "--max-jobs", "1")
+    with run_server(tmp_path_factory.mktemp("strict"), weights, *limits) as server:
+        server.wait_until_ready()
+        yield server

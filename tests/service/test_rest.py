@@ -1,0 +1,389 @@
+"""The REST API over real sockets, as curl sees it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx2
+import numpy as np
+import pytest
+
+from straightpcf.points.errors import ERRORS_BY_CODE
+from straightpcf.service.api.errors import STATUS_BY_CODE
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import RunningServer
+
+POINTS = 1500
+
+
+class Answer(NamedTuple):
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    def problem(self) -> dict[str, Any]:
+        assert self.headers["content-type"] == "application/problem+json"
+        problem: dict[str, Any] = json.loads(self.body)
+        assert set(problem) == {"type", "title", "status", "detail", "code", "retryable", "request_id"}
+        assert problem["status"] == self.status
+        assert problem["request_id"] == self.headers["x-request-id"]
+        assert problem["code"] in ERRORS_BY_CODE
+        return problem
+
+
+def curl(*arguments: str | Path, stdin: bytes = b"") -> Answer:
+    command = ["curl", "-s", "-i", "--max-time", "60", *map(str, arguments)]
+    output = subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
+    head, body = output.split(b"\r\n\r\n", 1)
+    while b" 100 " in head.split(b"\r\n", 1)[0]:
+        head, body = body.split(b"\r\n\r\n", 1)
+    status, *lines = head.decode("latin-1").split("\r\n")
+    return Answer(int(status.split()[1]), {k.lower(): v for k, v in (line.split(": ", 1) for line in lines)}, body)
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("clouds") / "torus.npy"
+    np.save(path, noisy(torus(POINTS), 0.01).astype(np.float32))
+    return path
+
+
+@pytest.fixture(scope="module")
+def large_cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cloud that takes a worker many seconds."""
+    path = tmp_path_factory.mktemp("clouds") / "large.npy"
+    np.save(path, noisy(sphere(40_000), 0.01))
+    return path
+
+
+def load(answer: Answer) -> np.ndarray[Any, Any]:
+    assert answer.status == 200, answer.body
+    return np.asarray(np.load(io.BytesIO(answer.body)))
+
+
+def test_a_form_a_raw_post_a_put_and_a_chunked_body_give_the_same_bytes(server: RunningServer, cloud: Path) -> None:
+    url = f"{server.url}/denoise"
+    answers = [
+        curl("-F", f"file=@{cloud}", "-F", "iterations=1", url),
+        curl("-F", "iterations=1", "-F", f"file=@{cloud}", url),
+        curl("--data-binary", f"@{cloud}", f"{url}?iterations=1"),
+        curl("-T", cloud, f"{url}?iterations=1"),
+        curl("-T", cloud, f"{server.url}/denoise/torus.npy?iterations=1"),
+        curl("-T", "-", f"{url}?iterations=1", stdin=cloud.read_bytes()),
+    ]
+    assert {answer.status for answer in answers} == {200}
+    assert len({answer.body for answer in answers}) == 1
+    result = load(answers[0])
+    assert result.dtype == np.float32
+    assert result.shape == (POINTS, 3)
+
+
+def test_the_headers_say_what_was_done(server: RunningServer, cloud: Path) -> None:
+    answer = curl("-F", f"file=@{cloud}", "-F", "iterations=1", "-H", "X-Request-Id: mine-1", f"{server.url}/denoise")
+    assert answer.headers["x-request-id"] == "mine-1"
+    assert answer.headers["x-points"] == str(POINTS)
+    assert answer.headers["x-iterations"] == "1"
+    assert answer.headers["x-untouched"] == "0"
+    assert float(answer.headers["x-noise-before"]) >= 0
+    assert float(answer.headers["x-noise-after"]) >= 0
+    assert answer.headers["content-disposition"] == 'attachment; filename="torus_clean.npy"'
+    assert int(answer.headers["content-length"]) == len(answer.body)
+
+
+def test_the_name_of_the_result_never_holds_a_path_or_a_line_break(server: RunningServer, cloud: Path) -> None:
+    for name in ("..%2F..%2Fetc%2Fscan.npy", "C%3A%5Cdata%5Cscan.npy", "a%0D%0AX-Evil%3A1%2Fscan.npy"):
+        answer = curl("--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=1&filename={name}")
+        assert answer.headers["content-disposition"] == 'attachment; filename="scan_clean.npy"'
+        assert "x-evil" not in answer.headers
+
+
+def test_the_result_has_the_format_that_was_asked_for(server: RunningServer, cloud: Path) -> None:
+    answer = curl("-F", f"file=@{cloud}", "-F", "iterations=1", "-F", "format=xyz", f"{server.url}/denoise")
+    assert answer.headers["content-disposition"] == 'attachment; filename="torus_clean.xyz"'
+    assert np.loadtxt(io.BytesIO(answer.body)).shape == (POINTS, 3)
+
+
+def test_strength_zero_gives_the_input_back(server: RunningServer, cloud: Path) -> None:
+    answer = curl("-F", f"file=@{cloud}", "-F", "iterations=1", "-F", "strength=0", f"{server.url}/denoise")
+    np.testing.assert_array_equal(load(answer), np.load(cloud))
+
+
+def test_rows_that_are_not_finite_pass_through(server: RunningServer, tmp_path: Path) -> None:
+    xyz = noisy(torus(POINTS), 0.01)
+    xyz[[3, 700]] = np.nan, np.inf
+    np.save(path := tmp_path / "holes.npy", xyz)
+    answer = curl("-F", f"file=@{path}", "-F", "iterations=1", f"{server.url}/denoise")
+    assert answer.headers["x-untouched"] == "2"
+    np.testing.assert_array_equal(load(answer)[[3, 700]], xyz[[3, 700]])
+
+
+def _npy(xyz: np.ndarray[Any, Any]) -> bytes:
+    np.save(buffer := io.BytesIO(), xyz)
+    return buffer.getvalue()
+
+
+def _zip_bomb() -> bytes:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (20_000_000, 3)})
+    with (
+        zipfile.ZipFile(buffer := io.BytesIO(), "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("xyz.npy", "w", force_zip64=True) as entry,
+    ):
+        entry.write(header.getvalue())
+        for _ in range(60):
+            entry.write(bytes(8_000_000))
+    return buffer.getvalue()
+
+
+_PLY = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+BAD_BODIES = {
+    "empty": ("scan.ply", b"", {"malformed_file", "unknown_format"}),
+    "empty without a name": (None, b"", {"malformed_file", "unknown_format"}),
+    "wrong magic": ("scan.ply", b"GIF89a" + bytes(range(256)), {"malformed_file", "unknown_format"}),
+    "no format at all": (None, bytes(range(256)), {"unknown_format"}),
+    "truncated binary": ("scan.ply", _PLY % (b"binary_little_endian", 500) + bytes(700), {"malformed_file"}),
+    "truncated ascii": ("scan.ply", _PLY % (b"ascii", 500) + b"0 0 0\n" * 20, {"malformed_file"}),
+    "zero points": ("scan.ply", _PLY % (b"ascii", 0), {"too_few_points", "malformed_file"}),
+    "one point": ("one.npy", _npy(np.zeros((1, 3))), {"too_few_points"}),
+    "10 points": ("ten.npy", _npy(sphere(10)), {"too_few_points"}),
+    "all NaN": ("nan.npy", _npy(np.full((500, 3), np.nan)), {"too_few_points"}),
+    "1e9 vertices": (
+        "scan.ply",
+        _PLY % (b"binary_little_endian", 10**9) + bytes(1200),
+        {"too_many_points", "malformed_file"},
+    ),
+    "4e9 vertices": ("scan.ply", _PLY % (b"ascii", 4 * 10**9) + b"0 0 0\n", {"too_many_points", "malformed_file"}),
+    "pickle in npy": ("evil.npy", _npy(np.array([{}, None], dtype=object)), {"malformed_file", "unsupported_cloud"}),
+    "zip bomb": ("bomb.npz", _zip_bomb(), {"too_many_points", "malformed_file", "too_large"}),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BODIES)
+def test_a_bad_file_is_a_problem_with_its_code_and_the_server_goes_on(
+    case: str, server: RunningServer, tmp_path: Path
+) -> None:
+    name, body, codes = BAD_BODIES[case]
+    (path := tmp_path / "body").write_bytes(body)
+    worker = server.worker_pid()
+    query = f"?filename={name}" if name else ""
+    problem = curl("--data-binary", f"@{path}", f"{server.url}/denoise{query}").problem()
+    assert problem["code"] in codes, problem
+    assert problem["status"] == STATUS_BY_CODE[problem["code"]]
+    assert server.worker_pid() == worker, "the worker did not survive"
+    assert curl(f"{server.url}/readyz").status == 200
+    assert not server.spooled_files()
+
+
+@pytest.mark.parametrize(
+    "xyz",
+    [np.ones((200, 3)), sphere(200) * 1e-30, sphere(200) * 1e6 + [5e6, -4e6, 3e5]],
+    ids=["all equal", "tiny", "far"],
+)
+def test_an_odd_cloud_is_denoised_to_finite_points(server: RunningServer, xyz: Any) -> None:
+    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=_npy(xyz))
+    assert np.isfinite(load(answer)).all()
+
+
+def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningServer) -> None:
+    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=_npy(sphere(200) * 1e300))
+    if answer.status == 200:
+        assert np.isfinite(load(answer)).all()
+    else:
+        assert issubclass(ERRORS_BY_CODE[answer.problem()["code"]], ERRORS_BY_CODE["invalid_request"])
+
+
+@pytest.mark.parametrize(
+    ("query", "word"),
+    [
+        ("iterations=0", "1..10"),
+        ("iterations=many", "iterations"),
+        ("seed=-1", "seed"),
+        ("strength=nan", "0..1"),
+        ("speed=9", "speed"),
+    ],
+)
+def test_a_bad_option_is_refused_before_the_body_is_read(server: RunningServer, query: str, word: str) -> None:
+    request = f"POST /denoise?{query} HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
+    problem = _raw(server, request.encode()).problem()
+    assert problem["code"] == "invalid_options"
+    assert word in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (("-F", "cloud=@{cloud};type=x/y"), "invalid_request"),
+        (("-F", "iterations=1"), "invalid_request"),
+        (("-F", "file=@{cloud}", "-F", "file=@{cloud}"), "invalid_request"),
+        (("-F", "file=@{cloud}", "-F", "iterations=x"), "invalid_options"),
+        (("-F", "file=@{cloud}", "-F", "format=gif"), "unknown_format"),
+        (("-H", "Content-Type: multipart/form-data", "-d", "x"), "invalid_request"),
+        (("-H", "Content-Type: multipart/form-data; boundary=b", "-d", "--b\r\nbroken"), "invalid_request"),
+    ],
+)
+def test_a_bad_form_is_a_problem(server: RunningServer, cloud: Path, arguments: tuple[str, ...], code: str) -> None:
+    filled = [argument.format(cloud=cloud) for argument in arguments]
+    assert curl(*filled, f"{server.url}/denoise").problem()["code"] == code
+
+
+@pytest.mark.parametrize(("method", "path", "status"), [("GET", "/nowhere", 404), ("DELETE", "/denoise", 405)])
+def test_wrong_paths_and_methods_are_problems_too(server: RunningServer, method: str, path: str, status: int) -> None:
+    answer = curl("-X", method, f"{server.url}{path}")
+    assert answer.problem()["status"] == status
+
+
+def _raw(server: RunningServer, request: bytes) -> Answer:
+    """Send these bytes and nothing more; read until the server is done."""
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(request)
+        data = b""
+        while b"\r\n\r\n" not in data or len(data.split(b"\r\n\r\n", 1)[1]) < _content_length(data):
+            received = connection.recv(65536)
+            if not received:
+                break
+            data += received
+    head, body = data.split(b"\r\n\r\n", 1)
+    status, *lines = head.decode("latin-1").split("\r\n")
+    return Answer(int(status.split()[1]), {k.lower(): v for k, v in (line.split(": ", 1) for line in lines)}, body)
+
+
+def _content_length(data: bytes) -> int:
+    head = data.split(b"\r\n\r\n", 1)[0].lower()
+    return int(head.split(b"content-length: ")[1].split(b"\r\n")[0])
+
+
+def test_a_body_that_declares_too_many_bytes_is_refused_unread(strict_server: RunningServer) -> None:
+    request = b"POST /denoise HTTP/1.1\r\nHost: x\r\nContent-Length: 100001\r\nExpect: 100-continue\r\n\r\n"
+    problem = _raw(strict_server, request).problem()
+    assert (problem["status"], problem["code"]) == (413, "too_many_bytes")
+    assert "100000" in problem["detail"]
+
+
+def test_a_chunked_body_is_stopped_as_soon_as_it_passes_the_limit(strict_server: RunningServer) -> None:
+    chunk = b"%x\r\n" % 60_000 + bytes(60_000) + b"\r\n"
+    head = b"POST /denoise HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
+    assert _raw(strict_server, head + chunk + chunk).problem()["code"] == "too_many_bytes"  # the body never ends
+    assert not strict_server.spooled_files()
+
+
+def test_clients_that_send_on_still_read_the_refusal(strict_server: RunningServer, tmp_path: Path) -> None:
+    (path := tmp_path / "large").write_bytes(bytes(5_000_000))
+    for arguments in (("-F", f"file=@{path}"), ("-T", str(path)), ("-H", "Expect:", "--data-binary", f"@{path}")):
+        assert curl(*arguments, f"{strict_server.url}/denoise").problem()["code"] == "too_many_bytes"
+
+
+def test_a_cloud_with_too_many_points_is_refused(strict_server: RunningServer) -> None:
+    body = _npy(sphere(4001).astype(np.float32))
+    problem = curl("--data-binary", "@-", f"{strict_server.url}/denoise", stdin=body).problem()
+    assert problem["code"] == "too_many_points"
+    assert "4000" in problem["detail"]
+
+
+def test_a_full_server_says_when_to_come_back(strict_server: RunningServer) -> None:
+    body = _npy(sphere(4000).astype(np.float32))
+    url = f"{strict_server.url}/denoise?iterations=2"
+    first: list[Answer] = []
+    thread = threading.Thread(target=lambda: first.append(curl("--data-binary", "@-", url, stdin=body)))
+    thread.start()
+    second = _until_busy(url, body)
+    thread.join()
+    problem = second.problem()
+    assert (problem["code"], problem["retryable"], problem["status"]) == ("server_busy", True, 503)
+    assert int(second.headers["retry-after"]) > 0
+    assert first[0].status == 200
+
+
+def _until_busy(url: str, body: bytes) -> Answer:
+    for _ in range(20):
+        answer = curl("--data-binary", "@-", f"{url}&strength=7", stdin=body)  # refused either way
+        if answer.status == 503:
+            return answer
+        time.sleep(0.05)
+    raise AssertionError("never busy")
+
+
+def test_the_worker_that_is_killed_is_replaced_and_the_request_still_answered(
+    server: RunningServer, cloud: Path
+) -> None:
+    worker = server.worker_pid()
+    os.kill(worker, signal.SIGSTOP)  # so that the job is certain to be in its hands
+    answers: list[Answer] = []
+    thread = threading.Thread(
+        target=lambda: answers.append(curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise"))
+    )
+    thread.start()
+    _wait_for(lambda: bool(server.spooled_files()))
+    time.sleep(0.3)
+    os.kill(worker, signal.SIGKILL)
+    thread.join()
+    assert load(answers[0]).shape == (POINTS, 3)
+    assert server.worker_pid() != worker
+    assert curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise").body == answers[0].body
+
+
+def test_a_client_that_goes_away_frees_the_worker_and_leaves_no_file(
+    server: RunningServer, cloud: Path, large_cloud: Path
+) -> None:
+    with pytest.raises(httpx2.ReadTimeout), large_cloud.open("rb") as body:
+        httpx2.post(f"{server.url}/denoise?iterations=10", content=body, timeout=httpx2.Timeout(30, read=1.5))
+    began = time.monotonic()
+    assert curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise").status == 200
+    assert time.monotonic() - began < 15, "the canceled job was computed to its end"
+    _wait_for(lambda: not server.spooled_files())
+
+
+def test_health_answers_fast_while_a_job_runs(server: RunningServer, large_cloud: Path) -> None:
+    process = subprocess.Popen(
+        ["curl", "-s", "--data-binary", f"@{large_cloud}", f"{server.url}/denoise?iterations=1"],
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        _wait_for(lambda: bool(server.spooled_files()))
+        with httpx2.Client(base_url=server.url) as client:
+            seconds = []
+            for _ in range(40):
+                began = time.perf_counter()
+                assert client.get("/healthz").status_code == 200
+                seconds.append(time.perf_counter() - began)
+                time.sleep(0.02)
+        assert process.poll() is None, "the job was over too early to tell"
+        assert np.median(seconds) < 0.05
+        assert max(seconds) < 1.0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_the_openapi_document_has_examples_and_problems(server: RunningServer) -> None:
+    document = json.loads(curl(f"{server.url}/openapi.json").body)
+    post = document["paths"]["/denoise"]["post"]
+    assert "example" in post["requestBody"]["content"]["multipart/form-data"]
+    assert "application/octet-stream" in post["requestBody"]["content"]
+    assert {"413", "415", "422", "503"} <= set(post["responses"])
+    assert "application/problem+json" in post["responses"]["422"]["content"]
+    assert "example" in document["components"]["schemas"]["Problem"]
+
+
+def test_info_says_what_the_server_takes(strict_server: RunningServer) -> None:
+    info = json.loads(curl(f"{strict_server.url}/v1/info").body)
+    assert (info["max_bytes"], info["max_points"], info["max_jobs"]) == (100_000, 4_000, 1)
+    assert info["devices"] == ["cpu"]
+    assert "ply" in {entry["name"] for entry in info["formats"]}
+
+
+def _wait_for(condition: Any, seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "not within the time"
+        time.sleep(0.02)
