@@ -47,6 +47,8 @@ class Encoder(nn.Module):
 
     def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
         """Map positions (B, P, 3) to features (B, rows, D) of the first `rows` points (all if None)."""
+        if x.device.type == "cpu" and len(x) > 1:  # one patch's tensors fit the cache, a batch's do not
+            return torch.cat([self(patch, rows) for patch in x.split(1)])  # type: ignore[no-untyped-call]
         h1 = self.conv1(x, knn(x, NEIGHBOURS))
         h2 = self.conv2(h1, knn(h1, NEIGHBOURS))
         # Only block 3 can be restricted: its inputs need every point's features.
