@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 
@@ -15,13 +16,13 @@ from straightpcf.model.nets.straightpcf import VelocityModule
 POINTS, NEIGHBOURS, PATCHES = 1000, 32, 4
 
 
-def milliseconds(call: Callable[[], object], repeats: int = 7) -> float:
+def milliseconds(function: Callable[..., object], *arguments: object, repeats: int = 7) -> float:
     """Return the median time of a call, per patch."""
-    call()
+    function(*arguments)
     times = []
     for _ in range(repeats):
         began = time.perf_counter()
-        call()
+        function(*arguments)
         times.append(time.perf_counter() - began)
     return sorted(times)[repeats // 2] * 1e3 / PATCHES
 
@@ -35,24 +36,24 @@ def main() -> None:
     print(f"{'':24} {'kernel':>8} {'torch':>8} {'GFLOP/s':>8}")
     for dims in (3, 32, 64):
         x = torch.randn(PATCHES, POINTS, dims, generator=generator)
-        ours, torchs = milliseconds(lambda: ops.knn(x, NEIGHBOURS)), milliseconds(lambda: ops.knn_torch(x, 32, POINTS))
+        ours, torchs = milliseconds(ops.knn, x, NEIGHBOURS), milliseconds(ops.knn_torch, x, NEIGHBOURS, POINTS)
         print(f"knn, {dims:2} dimensions {ours:13.2f} {torchs:8.2f}")
     index = ops.knn(torch.randn(PATCHES, POINTS, 3, generator=generator), NEIGHBOURS)
     for width in (32, 64, 256):
         a, b = (torch.randn(PATCHES, POINTS, width, generator=generator, requires_grad=True) for _ in range(2))
         weight = torch.randn(width, width, generator=generator).div_(width**0.5).requires_grad_()
         with torch.no_grad():
-            ours = milliseconds(lambda: ops.edge_max(a, b, index, weight))
-            torchs = milliseconds(lambda: ops.edge_max_torch(a, b, index, weight), 3)
+            ours = milliseconds(ops.edge_max, a, b, index, weight)
+            torchs = milliseconds(ops.edge_max_torch, a, b, index, weight, repeats=3)
         rate = 2 * POINTS * NEIGHBOURS * width**2 / ours / 1e6
         print(f"edge_max, {width:3} channels {ours:9.2f} {torchs:8.2f} {rate:8.0f}")
         out, grad = ops.edge_max(a, b, index, weight), torch.randn(PATCHES, POINTS, width, generator=generator)
-        ours = milliseconds(lambda: torch.autograd.grad(out, (a, b, weight), grad, retain_graph=True))
+        ours = milliseconds(partial(torch.autograd.grad, retain_graph=True), out, (a, b, weight), grad)
         print(f"  its gradient {ours:18.2f}")
     module = VelocityModule().eval()
     with torch.inference_mode():
         x = torch.randn(PATCHES, POINTS, 3, generator=generator) * 0.2
-        print(f"VelocityModule {milliseconds(lambda: module(x)):18.2f}")
+        print(f"VelocityModule {milliseconds(module, x):18.2f}")
 
 
 if __name__ == "__main__":
