@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from straightpcf.points.errors import ServerBusy, TooManyBytes
+from straightpcf.points.errors import JobCanceled, ServerBusy, TooManyBytes
 from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import Backend, FileJob, FileReport
@@ -51,8 +51,11 @@ class Job:
         self._publish(Event(kind="queued"))
 
     async def result(self) -> FileReport:
-        """Wait for the end; raises StraightPCFError. Ceasing to wait does not cancel the job."""
-        return await asyncio.shield(self._task)
+        """Wait for the end; raises StraightPCFError, JobCanceled among them. Ceasing to wait cancels nothing."""
+        await asyncio.wait([self._task])
+        if self._task.cancelled():
+            raise JobCanceled(f"job {self.id} was canceled")
+        return self._task.result()
 
     async def cancel(self) -> None:
         """Drop the job, whatever its state; returns once nothing works on it any more."""

@@ -67,9 +67,10 @@ class WorkerProcess:
             self._job = self._answer = self._on_progress = None
 
     async def stop(self, *, patience_seconds: float) -> None:
-        """Ask the process to end, and make it after a while; reaps it."""
-        self._send(None)
-        await asyncio.to_thread(self._process.join, patience_seconds)
+        """Ask the process to end, and make it after a while, or at once if it is still loading; reaps it."""
+        if self.ready.done():
+            self._send(None)
+            await asyncio.to_thread(self._process.join, patience_seconds)
         if self._process.is_alive():
             self._process.kill()
             await asyncio.to_thread(self._process.join)
@@ -116,4 +117,4 @@ class WorkerProcess:
         if not self.ready.done():
             self.ready.set_exception(WorkerDied(f"worker {self.pid} ended before it was ready"))
         if self._answer is not None and not self._answer.done():
-            self._answer.set_exception(WorkerDied(f"worker {self.pid} ended during job {self._job}"))
+            self._answer.set_exception(WorkerDied(f"worker {self.pid} ended during job {self._job and self._job.id}"))

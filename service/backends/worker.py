@@ -112,7 +112,9 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
         nonlocal sent
         while pipe.poll():
             message = pipe.recv()
-            if message is None or message == Cancel(job.id):
+            if message is None:
+                raise EOFError("the server ends this worker")
+            if message == Cancel(job.id):
                 raise JobCanceled(f"job {job.id} was canceled")
         if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS:
             sent = now

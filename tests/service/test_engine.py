@@ -10,6 +10,7 @@ import pytest
 
 from straightpcf.points.errors import (
     DeviceUnavailable,
+    JobCanceled,
     MalformedFile,
     ServerBusy,
     StraightPCFError,
@@ -138,6 +139,8 @@ def test_cancel_reaches_the_backend_and_ends_the_events(cloud: Path) -> None:
         await job.cancel()
         assert backend.canceled == [job.id]
         assert "completed" not in await events
+        with pytest.raises(JobCanceled, match=job.id):
+            await job.result()
 
     asyncio.run(scenario())
 

@@ -1,0 +1,102 @@
+"""Supervision of workers, with workers that die on command; the real ones die in test_rest and test_shutdown."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from straightpcf.points.errors import DeviceUnavailable, InternalError, StraightPCFError
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.backends import local
+from straightpcf.service.backends.base import FileJob, FileReport
+from straightpcf.service.backends.local import LocalBackend
+from straightpcf.service.backends.process import WorkerDied
+from straightpcf.service.backends.worker import WorkerSpec
+
+SPEC = WorkerSpec(device="cpu", weights=None, threads=None)
+JOB = FileJob(id="1", source=Path("in"), target=Path("out"), options=DenoiseOptions(), max_points=10)
+REPORT = FileReport(format="npy", points=1, untouched=0, iterations=1, noise_before=0.0, noise_after=0.0, seconds=0.0)
+
+
+class Workers:
+    """Stand in for WorkerProcess; the first `deaths` jobs kill their worker."""
+
+    def __init__(self, *, deaths: int = 0, failure: StraightPCFError | None = None) -> None:
+        self.deaths, self.failure = deaths, failure
+        self.started = 0
+
+    def __call__(self, spec: WorkerSpec) -> Worker:
+        self.started += 1
+        return Worker(self)
+
+
+class Worker:
+    def __init__(self, owner: Workers) -> None:
+        self.owner, self.pid = owner, owner.started
+        self.ready: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self.died: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        if owner.failure is not None:
+            self.ready.set_exception(owner.failure)
+        else:
+            self.ready.set_result("cpu")
+
+    @property
+    def alive(self) -> bool:
+        return not self.died.done()
+
+    async def run(self, job: FileJob, *, on_progress: Callable[[float], None]) -> FileReport:
+        await asyncio.sleep(0)
+        if self.owner.deaths == 0:
+            return REPORT
+        self.owner.deaths -= 1
+        self.died.set_result(None)
+        raise WorkerDied("killed")
+
+    async def stop(self, *, patience_seconds: float) -> None:
+        if self.alive:
+            self.died.set_result(None)
+
+
+def run(backend: LocalBackend, jobs: int = 1) -> list[FileReport]:
+    async def scenario() -> list[FileReport]:
+        await backend.start()
+        try:
+            many = (backend.run(JOB, on_start=lambda: None, on_progress=lambda _: None) for _ in range(jobs))
+            return await asyncio.wait_for(asyncio.gather(*many), timeout=5)
+        finally:
+            await backend.stop()
+
+    return asyncio.run(scenario())
+
+
+def test_a_job_whose_worker_dies_once_is_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
+    assert run(LocalBackend([SPEC])) == [REPORT]
+    assert workers.started == 2
+
+
+def test_a_job_that_kills_two_workers_is_given_up_and_the_next_one_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=2))
+    backend = LocalBackend([SPEC])
+    with pytest.raises(InternalError, match="2 times"):
+        run(backend)
+    assert run(LocalBackend([SPEC])) == [REPORT]
+    assert workers.deaths == 0
+
+
+def test_many_jobs_share_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers())
+    assert run(LocalBackend([SPEC, SPEC]), jobs=20) == [REPORT] * 20
+    assert workers.started == 2
+
+
+def test_a_worker_that_can_never_start_fails_every_job_and_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(failure=DeviceUnavailable("no cuda")))
+    told: list[str] = []
+    backend = LocalBackend([SPEC], on_failure=lambda: told.append("told"))
+    with pytest.raises(DeviceUnavailable):
+        run(backend, jobs=3)
+    assert (told, workers.started) == (["told"], 1)
