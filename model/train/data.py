@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["NOISE_STD", "PATCH_SIZE", "VALIDATION_SHAPES", "Batch", "PatchSource"]
+__all__ = ["NOISE_STD", "PATCH_SIZE", "VALIDATION_EVERY", "Batch", "PatchSource", "held_out_shapes"]
 
 PATCH_SIZE = 1000
 NOISE_STD = 0.02  # of x_0, in radii of the cloud's bounding sphere
 SCALES = (0.8, 1.2)  # augmentation
 # Every tenth shape by name stays out of training, so that there is something honest to choose by.
-VALIDATION_SHAPES = 10
+VALIDATION_EVERY = 10
 # Noise moves points in and out of a patch: the noisy patch is chosen among this many clean neighbours.
 _CANDIDATES = 1300
 
@@ -44,6 +45,12 @@ class Batch:
         return Batch(self.noisy.to(device), self.clean.to(device), self.time.to(device))
 
 
+def held_out_shapes(names: Iterable[str]) -> set[str]:
+    """Choose the validation shapes among keys `<shape>/<resolution>`: every tenth by name."""
+    shapes = sorted({name.split("/")[0] for name in names})
+    return set(shapes[VALIDATION_EVERY // 2 :: VALIDATION_EVERY])
+
+
 class PatchSource:
     """Draw patches from clean clouds, each in the frame where its bounding sphere has radius 1."""
 
@@ -57,8 +64,7 @@ class PatchSource:
     def read(cls, path: Path, *, validation: bool = False) -> PatchSource:
         """Read an .npz of clean clouds named `<shape>/<resolution>`: the training shapes, or the held-out ones."""
         with np.load(path, allow_pickle=False) as archive:
-            shapes = sorted({name.split("/")[0] for name in archive.files})
-            held_out = set(shapes[VALIDATION_SHAPES // 2 :: VALIDATION_SHAPES])
+            held_out = held_out_shapes(archive.files)
             return cls([archive[name] for name in archive.files if (name.split("/")[0] in held_out) == validation])
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:

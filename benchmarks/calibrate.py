@@ -1,0 +1,70 @@
+"""Calibrate a trained state and write the weights that ship.
+
+python -m benchmarks.calibrate --state runs/dm/state.safetensors --out
+
+Uses the held-out training shapes only, never the test split. Prints the table of d against known noise, and what
+`auto` would do against the best fixed number of passes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.quality import SHARED
+from straightpcf.model.checkpoint import save_checkpoint
+from straightpcf.model.filter import DEFAULT_WEIGHTS
+from straightpcf.model.train.calibrate import calibrate, passes
+from straightpcf.model.train.data import held_out_shapes
+from straightpcf.model.train.state import read_network
+
+
+def main() -> None:
+    """Print both tables; with --out write the weights."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3")
+    parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
+    parser.add_argument("--resolution", type=int, nargs="+", default=[10000, 50000])
+    parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
+    arguments = parser.parse_args()
+
+    network, progress = read_network(arguments.state)
+    clouds = _clouds(arguments.data, arguments.resolution)
+    calibration, traces = calibrate(network, clouds, threads=arguments.threads)
+    print(f"{'cloud':18} {'noise':>7}  {'d before each pass':32} {'CD x1e4 after 0, 1, ... passes':42} auto best")
+    for t in traces:
+        chosen, best = passes(calibration, t.distances), int(np.argmin(t.chamfer))
+        distances = " ".join(f"{d:.3f}" for d in t.distances)
+        chamfer = " ".join(f"{1e4 * c:7.3f}" for c in t.chamfer)
+        print(f"{t.cloud:18} {t.noise_std:7.4f}  {distances:32} {chamfer:42} {chosen:4} {best:4}")
+    print(f"\n{'noise':>7} {'d':>7} {'auto / best CD':>15}")
+    for std in sorted({t.noise_std for t in traces}):
+        those = [t for t in traces if t.noise_std == std]
+        ratio = np.mean([t.chamfer[passes(calibration, t.distances)] / max(min(t.chamfer[1:]), 1e-12) for t in those])
+        print(f"{std:7.4f} {np.median([t.distances[0] for t in those]):7.3f} {ratio:15.3f}")
+    print(json.dumps(calibration.to_metadata()))
+    if arguments.out is not None:
+        save_checkpoint(network, arguments.out, {"training": progress, **calibration.to_metadata()})
+        arguments.out.chmod(0o644)
+        print(f"written {arguments.out}")
+
+
+def _clouds(path: Path, resolutions: list[int]) -> dict[str, npt.NDArray[np.float64]]:
+    clouds = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for name in archive.files:
+            shape, resolution = name.split("/")
+            if shape in held_out_shapes(archive.files) and int(resolution) in resolutions:
+                xyz = archive[name].astype(np.float64)
+                xyz -= (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+                clouds[name] = xyz / float(np.linalg.norm(xyz, axis=1).max())
+    return clouds
+
+
+if __name__ == "__main__":
+    main()
