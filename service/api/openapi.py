@@ -8,7 +8,7 @@ from straightpcf.points.formats import FORMATS
 from straightpcf.points.options import MAX_ITERATIONS
 from straightpcf.service.api.schemas import Problem
 
-__all__ = ["DENOISE_BODY", "DENOISE_FORM_BODY", "DENOISE_RESPONSES", "QUERY_PARAMETERS"]
+__all__ = ["DENOISE_BODY", "DENOISE_FORM_BODY", "DENOISE_RESPONSES", "PATH_PARAMETER", "QUERY_PARAMETERS"]
 
 _FORMAT_NAMES = [format.name for format in FORMATS]
 
@@ -57,6 +57,15 @@ QUERY_PARAMETERS: list[dict[str, Any]] = [
     }
     for name, schema in _OPTIONS.items()
 ]
+
+PATH_PARAMETER: dict[str, Any] = {
+    "name": "filename",
+    "in": "path",
+    "required": True,
+    "description": "The name of the file, as `curl -T` appends it.",
+    "schema": {"type": "string"},
+    "example": "scan.ply",
+}
 
 _RAW: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 

@@ -19,7 +19,13 @@ from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.formats import FORMATS, format_named
 from straightpcf.points.options import MAX_ITERATIONS, DenoiseOptions
 from straightpcf.service.api.body import check_declared_size, receive_upload
-from straightpcf.service.api.openapi import DENOISE_BODY, DENOISE_FORM_BODY, DENOISE_RESPONSES, QUERY_PARAMETERS
+from straightpcf.service.api.openapi import (
+    DENOISE_BODY,
+    DENOISE_FORM_BODY,
+    DENOISE_RESPONSES,
+    PATH_PARAMETER,
+    QUERY_PARAMETERS,
+)
 from straightpcf.service.api.schemas import FormatInfo, Health, Info
 from straightpcf.service.backends.base import FileReport
 from straightpcf.service.engine import Engine, Job
@@ -47,10 +53,10 @@ router = APIRouter()
     summary="Denoise one point cloud (what `curl -T scan.ply URL/denoise/` sends)",
     response_class=FileResponse,
     responses=DENOISE_RESPONSES,
-    openapi_extra={"requestBody": DENOISE_BODY, "parameters": QUERY_PARAMETERS},
+    openapi_extra={"requestBody": DENOISE_BODY, "parameters": [PATH_PARAMETER, *QUERY_PARAMETERS]},
     operation_id="denoise_put",
 )
-async def denoise(request: Request, filename: str | None = None) -> FileResponse:
+async def denoise(request: Request) -> FileResponse:
     """Take a noisy cloud and give back the same points, in the same order, on the surface.
 
     Send a form with the cloud in the field `file`, or the cloud itself as the body and the options in the query
@@ -66,7 +72,7 @@ async def denoise(request: Request, filename: str | None = None) -> FileResponse
         upload = await receive_upload(request, source, limits=engine.limits)
         fields = {**request.query_params, **upload.fields}
         options, format = _parse_fields(fields)
-        name = _file_name(fields.get("filename") or filename or upload.name)
+        name = _file_name(fields.get("filename") or request.path_params.get("filename") or upload.name)
         job = engine.submit(source, target, options=options, name=name, format=format)
         report = await _result_while_connected(job, request)
         return _SpooledFileResponse(

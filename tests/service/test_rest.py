@@ -373,6 +373,11 @@ def test_the_openapi_document_has_examples_and_problems(server: RunningServer) -
     assert {"413", "415", "422", "503"} <= set(post["responses"])
     assert "application/problem+json" in post["responses"]["422"]["content"]
     assert "example" in document["components"]["schemas"]["Problem"]
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            names = [(each["name"], each["in"]) for each in operation.get("parameters", [])]
+            assert len(names) == len(set(names))
+            assert ("{filename}" in path) == (("filename", "path") in names)
 
 
 def test_info_says_what_the_server_takes(strict_server: RunningServer) -> None:
