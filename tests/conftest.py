@@ -1,4 +1,4 @@
-"""Fixtures that more than one package of tests needs: weights, and servers that run as processes of their own."""
+"""Fixtures that more than one package of tests needs: servers that run as processes of their own."""
 
 from __future__ import annotations
 
@@ -57,13 +57,11 @@ class RunningServer:
 
 
 @contextmanager
-def run_server(folder: Path, weights: Path | None, *arguments: str) -> Iterator[RunningServer]:
+def run_server(folder: Path, *arguments: str) -> Iterator[RunningServer]:
     """Start a server, wait until it listens, and end it politely."""
     log = folder / "server.log"
     command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--device", "cpu"]
     command += ["--data-dir", str(folder / "data"), *arguments]
-    if weights is not None:
-        command += ["--weights", str(weights)]
     with log.open("wb") as sink:
         process = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env=clean_environment())
     try:
@@ -94,26 +92,8 @@ def _url_in(log: Path, process: subprocess.Popen[bytes]) -> str:
 
 
 @pytest.fixture(scope="session")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
-    """The shipped weights; where none are shipped yet, an untrained network, whose results are no use but finite."""
-    from straightpcf.model.filter import DEFAULT_WEIGHTS
-
-    if DEFAULT_WEIGHTS.is_file():
-        return None
-    import torch
-
-    from straightpcf.model.checkpoint import save_checkpoint
-    from straightpcf.model.nets.straightpcf import StraightPCF
-
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
-    save_checkpoint(StraightPCF(), path)
-    return path
-
-
-@pytest.fixture(scope="session")
-def shared_server(tmp_path_factory: pytest.TempPathFactory, weights: Path | None) -> Iterator[RunningServer]:
-    with run_server(tmp_path_factory.mktemp("server"), weights) as server:
+def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    with run_server(tmp_path_factory.mktemp("server")) as server:
         server.wait_until_ready()
         yield server
 
@@ -126,9 +106,9 @@ def server(shared_server: RunningServer) -> RunningServer:
 
 
 @pytest.fixture(scope="session")
-def strict_server(tmp_path_factory: pytest.TempPathFactory, weights: Path | None) -> Iterator[RunningServer]:
+def strict_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     """A server with small limits: 100,000 bytes, 4,000 points, one request at a time."""
     limits = ("--max-bytes", "100000", "--max-points", "4000", "--max-jobs", "1")
-    with run_server(tmp_path_factory.mktemp("strict"), weights, *limits) as server:
+    with run_server(tmp_path_factory.mktemp("strict"), *limits) as server:
         server.wait_until_ready()
         yield server

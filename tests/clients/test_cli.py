@@ -31,10 +31,9 @@ def scan(tmp_path: Path) -> Path:
     return path
 
 
-def test_denoise_writes_the_same_points_and_reports_as_json(scan: Path, weights: Path | None) -> None:
+def test_denoise_writes_the_same_points_and_reports_as_json(scan: Path) -> None:
     target = scan.with_name("clean.npy")
-    arguments = [] if weights is None else ["--weights", weights]
-    done = cli("denoise", scan, target, "--iterations", "1", "--device", "cpu", "--json", *arguments)
+    done = cli("denoise", scan, target, "--iterations", "1", "--device", "cpu", "--json")
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["points"], report["iterations"], report["format"]) == (POINTS, 1, "npy")
@@ -44,11 +43,10 @@ def test_denoise_writes_the_same_points_and_reports_as_json(scan: Path, weights:
     assert sorted(path.name for path in scan.parent.iterdir()) == ["clean.npy", "scan.npy"]
 
 
-def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: Path, weights: Path | None) -> None:
+def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: Path) -> None:
     np.save(few := tmp_path / "few.npy", sphere(5))
     (target := tmp_path / "clean.npy").write_bytes(b"of old")
-    arguments = [] if weights is None else ["--weights", weights]
-    done = cli("denoise", few, target, *arguments)
+    done = cli("denoise", few, target)
     assert done.returncode == 3
     assert done.stderr.startswith("error [too_few_points]: ")
     assert done.stderr.count("\n") == 1

@@ -14,9 +14,9 @@ from tests.clouds import noisy, torus
 from tests.conftest import RunningServer, run_server
 
 
-def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Path, weights: Path | None) -> None:
+def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Path) -> None:
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(1500), 0.01))
-    with run_server(tmp_path, weights) as server:
+    with run_server(tmp_path) as server:
         # The request comes before the worker is warm: it waits for it.
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=1"]
         request = subprocess.Popen(command, stdout=subprocess.PIPE)
@@ -31,11 +31,9 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         assert "Traceback" not in server.log.read_text()
 
 
-def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_sweeps_the_spool(
-    tmp_path: Path, weights: Path | None
-) -> None:
+def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_sweeps_the_spool(tmp_path: Path) -> None:
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(30_000), 0.01))
-    with run_server(tmp_path, weights) as server:
+    with run_server(tmp_path) as server:
         server.wait_until_ready()
         worker = server.worker_pid()
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=3"]
@@ -48,7 +46,7 @@ def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_sweeps_the_spo
             assert time.monotonic() < deadline, "the worker outlives its server"
             time.sleep(0.05)
         assert server.spooled_files()
-    with run_server(tmp_path, weights) as server:
+    with run_server(tmp_path) as server:
         assert not server.spooled_files()
 
 
