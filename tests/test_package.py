@@ -1,0 +1,74 @@
+"""What ships, and what it is called."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+PUBLIC = {
+    "straightpcf": ["__version__"],
+    "straightpcf.points.cloud": ["PointCloud"],
+    "straightpcf.points.options": ["MAX_ITERATIONS", "DenoiseOptions"],
+    "straightpcf.model.filter": [
+        "DEFAULT_WEIGHTS",
+        "MIN_POINTS",
+        "DenoiseResult",
+        "Filter",
+        "FinishedPatch",
+        "Run",
+        "denoise",
+        "load_filter",
+    ],
+    "straightpcf.model.metrics": ["chamfer_distance", "point_to_mesh_distance", "unit_sphere"],
+    "straightpcf.model.nets.straightpcf": ["DistanceModule", "StraightPCF", "VelocityModule"],
+    "straightpcf.model.train": ["Stage", "TrainStep", "train"],
+}
+
+
+@pytest.mark.parametrize("module", PUBLIC)
+def test_the_public_names_stay_what_they_are(module: str) -> None:
+    assert importlib.import_module(module).__all__ == PUBLIC[module]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+        return archive.namelist()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "straightpcf/__init__.py",
+        "straightpcf/py.typed",
+        "straightpcf/points/cloud.py",
+        "straightpcf/model/kernels/edgeconv.cpp",
+        "straightpcf/model/weights/straightpcf.safetensors",
+        "straightpcf/model/weights/README.md",
+        "straightpcf/service/app.py",
+        "straightpcf/clients/cli.py",
+    ],
+)
+def test_the_wheel_holds_the_package_the_weights_and_the_kernels(wheel: list[str], path: str) -> None:
+    assert path in wheel
+
+
+def test_the_wheel_holds_nothing_else(wheel: list[str]) -> None:
+    assert {name.split("/")[0] for name in wheel} == {"straightpcf", "straightpcf-0.1.0.dist-info"}
+    assert not [name for name in wheel if "resume" in name or name.endswith((".so", ".pyc"))]
+
+
+@pytest.mark.parametrize("module", ["straightpcf.clients.sdk", "straightpcf.points.formats", "straightpcf.service.app"])
+def test_importing_it_brings_no_torch(module: str) -> None:
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=False).returncode == 0
