@@ -1,0 +1,93 @@
+"""Every file format, in one explicit table, and how a file finds its own."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path, PurePath
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, StraightPCFError, UnknownFormat
+from straightpcf.points.formats.base import DEFAULT_MAX_POINTS, Format
+from straightpcf.points.formats.npy import Npy
+from straightpcf.points.formats.npz import Npz
+from straightpcf.points.formats.ply import Ply
+
+__all__ = [
+    "DEFAULT_MAX_POINTS",
+    "FORMATS",
+    "Format",
+    "format_for",
+    "format_named",
+    "read_cloud",
+    "write_cloud",
+]
+
+FORMATS: tuple[Format, ...] = (Ply(), Npy(), Npz())
+
+_WITHOUT_MAGIC = ("xyz", "kitti")  # recognised by the suffix alone
+_HEAD_BYTES = 4096
+
+
+def read_cloud(
+    path: Path, *, name: str | None = None, max_points: int = DEFAULT_MAX_POINTS
+) -> tuple[PointCloud, Format]:
+    """Read a file by its magic bytes, or by the suffix of `name` (default: of path) where its format has none.
+
+    Raises UnknownFormat, MalformedFile, UnsupportedCloud, TooManyPoints, TooManyBytes, MissingDependency, OSError.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    called = name or path.name
+    if not head:
+        raise MalformedFile(f"{called} is empty (0 bytes)")
+    format = _recognised(head, called)
+    try:
+        return format.read(path, max_points=max_points), format
+    except (StraightPCFError, MemoryError):
+        raise
+    except Exception as exc:
+        if isinstance(exc, OSError) and exc.errno not in (None, errno.EINVAL):
+            raise  # the disk, not the file; EINVAL is a seek to where a broken file pointed
+        raise MalformedFile(f"{called} is no readable {format.name} file: {type(exc).__name__}: {exc}"[:500]) from exc
+
+
+def write_cloud(cloud: PointCloud, path: Path, format: Format) -> None:
+    """Write a cloud; a cloud that was read in the same format keeps everything but the positions that moved."""
+    format.write(cloud, path)
+
+
+def format_named(name: str) -> Format:
+    """Return the format of that name; raises UnknownFormat."""
+    for format in FORMATS:
+        if format.name == name.lower():
+            return format
+    raise UnknownFormat(f"no format is named {name[:40]!r}; there are {_known()}")
+
+
+def format_for(filename: str) -> Format:
+    """Return the format that the suffix names; raises UnknownFormat."""
+    suffix = PurePath(filename).suffix.lower()
+    for format in FORMATS:
+        if suffix in format.suffixes:
+            return format
+    raise UnknownFormat(
+        f"no format has the suffix {suffix[:40]!r} of {PurePath(filename).name[:80]}; there are {_known()}"
+    )
+
+
+def _recognised(head: bytes, called: str) -> Format:
+    for format in FORMATS:
+        if format.sniff(head):
+            return format
+    suffix = PurePath(called).suffix.lower()
+    for format in FORMATS:
+        if format.name in _WITHOUT_MAGIC and suffix in format.suffixes:
+            return format
+    raise UnknownFormat(
+        f"{PurePath(called).name[:80]} begins with {head[:8]!r}, which no format does, and its suffix names none; "
+        f"there are {_known()}"
+    )
+
+
+def _known() -> str:
+    return ", ".join(f"{format.name} ({' '.join(format.suffixes)})" for format in FORMATS)

@@ -1,0 +1,50 @@
+"""What every format does: recognise its bytes, read a cloud, write one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import ClassVar
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, TooManyPoints
+
+__all__ = ["DEFAULT_MAX_POINTS", "Format", "check_count", "check_room"]
+
+DEFAULT_MAX_POINTS = 100_000_000
+
+
+class Format(ABC):
+    """Read and write one kind of file.
+
+    A format that reads a cloud and writes it again changes nothing but the positions that moved; the rest of the file,
+    down to the bits of a NaN, comes back. It may raise anything on a broken file: `read_cloud` makes it MalformedFile.
+    """
+
+    name: ClassVar[str]
+    suffixes: ClassVar[tuple[str, ...]]
+    media_type: ClassVar[str] = "application/octet-stream"
+
+    @abstractmethod
+    def sniff(self, head: bytes) -> bool:
+        """Tell whether a file that begins with `head` (up to 4 KiB) is of this format; False if it has no magic."""
+
+    @abstractmethod
+    def read(self, path: Path, *, max_points: int) -> PointCloud:
+        """Read a file; raises MalformedFile, UnsupportedCloud, TooManyPoints, the last before memory is taken."""
+
+    @abstractmethod
+    def write(self, cloud: PointCloud, path: Path) -> None:
+        """Write a cloud: into the file it came from, as `cloud.source` holds it, or else into a new one."""
+
+
+def check_count(declared: int, max_points: int, where: str) -> None:
+    """Raise TooManyPoints if `where` declares more than max_points."""
+    if declared > max_points:
+        raise TooManyPoints(f"{where} declares {declared} points; the limit is {max_points}")
+
+
+def check_room(needed: int, available: int, *, what: str) -> None:
+    """Raise MalformedFile if `what` needs more bytes than the file still has, before memory is taken for it."""
+    if needed > available:
+        raise MalformedFile(f"{what} needs at least {needed} bytes, the file has {max(available, 0)}: it is truncated")

@@ -1,0 +1,142 @@
+"""PLY: text and binary of both byte orders; everything but moved positions is copied byte for byte."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.ply_header import PlyElement, PlyHeader, read_header
+from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows
+from straightpcf.points.formats.positions import AXES, gathered, moved, narrowed, put_positions, scattered
+from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.text import refuse_binary, replaced
+
+__all__ = ["Ply"]
+
+_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
+_NAMES |= {"f4": "float", "f8": "double"}
+
+
+@dataclass(frozen=True)
+class PlySource:
+    """Hold the whole file, where its vertices stand, and the positions that were read from it."""
+
+    raw: bytes
+    begin: int
+    rows: AsciiRows | BinaryRows
+    vertex: PlyElement
+    xyz: npt.NDArray[np.float64]
+
+
+class Ply(Format):
+    """Read and write PLY; x, y and z of the element `vertex` must be scalar float or double properties."""
+
+    name = "ply"
+    suffixes = (".ply",)
+    media_type = "application/vnd.ply"
+
+    def sniff(self, head: bytes) -> bool:
+        """Recognise the first line."""
+        return head[:4] in (b"ply\n", b"ply\r") or head[:5] in (b"ply \n", b"ply \r")
+
+    def read(self, path: Path, *, max_points: int) -> PointCloud:
+        """Read the vertices; scalar properties become attributes."""
+        raw = path.read_bytes()
+        header = read_header(raw)
+        vertex = _vertex(header)
+        check_count(vertex.count, max_points, where="element vertex")
+        begin, rows = _find(raw, header, vertex)
+        values = rows.values if isinstance(rows, AsciiRows) else _values(raw, vertex, rows)
+        xyz = np.stack([values[axis].astype(np.float64) for axis in AXES], axis=1)
+        attributes = {name: value for name, value in values.items() if name not in AXES}
+        return PointCloud(xyz, attributes, PlySource(raw, begin, rows, vertex, xyz.copy()))
+
+    def write(self, cloud: PointCloud, path: Path) -> None:
+        """Write the file that was read with its positions replaced, or a new binary one."""
+        source = cloud.source
+        if not isinstance(source, PlySource):
+            path.write_bytes(_new_file(cloud))
+        elif isinstance(source.rows, AsciiRows):
+            starts = np.stack([source.rows.starts[axis] for axis in AXES], axis=1)
+            ends = np.stack([source.rows.ends[axis] for axis in AXES], axis=1)
+            path.write_bytes(replaced(source.raw, starts, ends, cloud.xyz, source.xyz))
+        else:
+            path.write_bytes(_patched(source, source.rows, cloud.xyz))
+
+
+def _vertex(header: PlyHeader) -> PlyElement:
+    vertex = next((element for element in header.elements if element.name == "vertex"), None)
+    if vertex is None:
+        names = ", ".join(element.name for element in header.elements)[:200]
+        raise MalformedFile(f"the PLY file has no element vertex; its elements are: {names or 'none'}")
+    properties = {p.name: p for p in vertex.properties}
+    for axis in AXES:
+        if axis not in properties:
+            raise MalformedFile(f"element vertex has no property {axis}")
+        if properties[axis].counter is not None or properties[axis].dtype.kind != "f":
+            kind = "a list" if properties[axis].counter is not None else properties[axis].dtype.name
+            raise UnsupportedCloud(f"property {axis} of element vertex is {kind}; moved points need float or double")
+    return vertex
+
+
+def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, AsciiRows | BinaryRows]:
+    """Walk every element, so that a truncated file is found out whatever stands last in it."""
+    if header.is_ascii:
+        refuse_binary(raw, header.size)
+    at, line = header.size, header.lines + 1
+    found: tuple[int, AsciiRows | BinaryRows] | None = None
+    for element in header.elements:
+        rows: AsciiRows | BinaryRows
+        if header.is_ascii:
+            rows = ascii_rows(raw, at, element, line, keep=element is vertex)
+        else:
+            rows = binary_rows(raw, at, element)
+        if element is vertex:
+            found = at, rows
+        at, line = rows.end, line + element.count
+    if found is None:  # pragma: no cover - _vertex has looked
+        raise MalformedFile("the PLY file has no element vertex")
+    return found
+
+
+def _values(raw: bytes, vertex: PlyElement, rows: BinaryRows) -> dict[str, npt.NDArray[Any]]:
+    scalars = [p for p in vertex.properties if p.counter is None]
+    if rows.fixed is not None:
+        return {p.name: rows.fixed[p.name] for p in scalars}
+    return {p.name: gathered(raw, rows.offsets[p.name], p.dtype) for p in scalars}
+
+
+def _patched(source: PlySource, rows: BinaryRows, xyz: npt.NDArray[np.float64]) -> bytes | bytearray:
+    changed = moved(xyz, source.xyz)
+    if not changed.any():
+        return source.raw
+    out = bytearray(source.raw)
+    if rows.fixed is not None:
+        table = np.frombuffer(out, rows.fixed.dtype, len(rows.fixed), source.begin)
+        put_positions([table[axis] for axis in AXES], xyz, source.xyz)
+        return out
+    kinds = {p.name: p.dtype for p in source.vertex.properties}
+    for column, axis in enumerate(AXES):
+        picked = changed[:, column]
+        values = narrowed(xyz[picked, column], kinds[axis], what=f"the new {axis}")
+        scattered(out, rows.offsets[axis][picked], values)
+    return out
+
+
+def _new_file(cloud: PointCloud) -> bytes:
+    """Write binary little-endian with double positions and every attribute as scalar properties."""
+    columns = {axis: cloud.xyz[:, column] for column, axis in enumerate(AXES)}
+    columns |= scalar_columns(cloud.attributes, _NAMES, taken=AXES)
+    lines = ["ply", "format binary_little_endian 1.0", "comment written by straightpcf", f"element vertex {len(cloud)}"]
+    lines += [f"property {_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
+    table = np.empty(len(cloud), [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    return "\n".join([*lines, "end_header", ""]).encode() + table.tobytes()

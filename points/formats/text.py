@@ -1,0 +1,208 @@
+"""Text tables: find every token of every line, read numbers, and put new numbers in the place of old ones.
+
+Everything is done on blocks of a few megabytes with numpy, so that a million lines take a second or two; the text
+between the replaced tokens is copied byte for byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.points.errors import MalformedFile
+from straightpcf.points.formats.positions import moved, number_text
+
+__all__ = ["Lines", "as_integers", "as_numbers", "blocks", "refuse_binary", "replaced", "shown"]
+
+BLOCK_BYTES = 1 << 23
+MAX_NUMBER_CHARACTERS = 400
+_Offsets = npt.NDArray[np.int64]
+
+_IS_SPACE = np.zeros(256, bool)
+_IS_SPACE[list(b" \t\n\v\f\r")] = True
+_IN_NUMBER = np.zeros(256, bool)
+_IN_NUMBER[list(b"0123456789+-.eEnNaAiIfFtTyY\0")] = True
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Hold where the tokens of some whole lines are; every offset counts from the file's first byte.
+
+    line_starts: (L,) int64.  first, counts: (L,) the lines' first token and their number of tokens.
+    starts, ends: (T,) int64, the tokens of all lines in order.
+    """
+
+    raw: bytes
+    line_starts: _Offsets
+    first: _Offsets
+    counts: _Offsets
+    starts: _Offsets
+    ends: _Offsets
+
+    def __len__(self) -> int:
+        return len(self.line_starts)
+
+    def head(self, count: int) -> Lines:
+        """Return the first `count` lines only."""
+        return Lines(
+            self.raw, self.line_starts[:count], self.first[:count], self.counts[:count], self.starts, self.ends
+        )
+
+    def pick(self, rows: npt.NDArray[Any]) -> Lines:
+        """Return the lines that an index or mask of lines picks."""
+        return Lines(self.raw, self.line_starts[rows], self.first[rows], self.counts[rows], self.starts, self.ends)
+
+
+def blocks(raw: bytes, begin: int, *, delimiter: bytes | None = None) -> Iterator[tuple[Lines, int]]:
+    """Yield the lines from byte `begin` on, block by block, each with the offset where the next block begins.
+
+    Lines end in LF, CRLF or a lone CR.  Without a delimiter, tokens are runs of anything but white space; with one,
+    they are what stands between two delimiters, white space trimmed, and may be empty.
+    """
+    while begin < len(raw):
+        end = raw.rfind(b"\n", begin, begin + BLOCK_BYTES) + 1
+        if end == 0:
+            end = raw.find(b"\n", begin + BLOCK_BYTES) + 1 or len(raw)
+        yield _split(raw, begin, end, delimiter), end
+        begin = end
+
+
+def _split(raw: bytes, begin: int, end: int, delimiter: bytes | None) -> Lines:
+    text = np.frombuffer(raw, np.uint8, end - begin, begin)
+    is_break = text == 10
+    lone = np.flatnonzero(text == 13)
+    is_break[lone[(lone + 1 == len(text)) | (text[np.minimum(lone + 1, len(text) - 1)] != 10)]] = True
+    breaks = np.flatnonzero(is_break)
+    line_starts = np.concatenate([[0], breaks + 1])
+    line_ends = np.concatenate([breaks, [len(text)]])
+    if line_starts[-1] == len(text):  # the block ends with a line's end: no further line begins
+        line_starts, line_ends = line_starts[:-1], line_ends[:-1]
+
+    in_token = ~_IS_SPACE[text]
+    if delimiter is not None:
+        in_token &= text != delimiter[0]
+    edges = np.diff(in_token.view(np.int8), prepend=np.int8(0), append=np.int8(0))
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    first, last = np.searchsorted(starts, line_starts), np.searchsorted(starts, line_ends)
+    if delimiter is not None:
+        is_blank = first == last
+        marks = np.flatnonzero(text == delimiter[0])
+        starts, ends, first, last = _fields(marks, line_starts, line_ends, starts, ends)
+        last = np.where(is_blank, first, last)
+    return Lines(raw, line_starts + begin, first, last - first, starts + begin, ends + begin)
+
+
+def _fields(
+    marks: _Offsets, line_starts: _Offsets, line_ends: _Offsets, starts: _Offsets, ends: _Offsets
+) -> tuple[_Offsets, _Offsets, _Offsets, _Offsets]:
+    """Return tokens between delimiters at `marks`, trimmed to the words (starts, ends) inside them."""
+    field_starts = np.sort(np.concatenate([line_starts, marks + 1]))
+    field_ends = np.sort(np.concatenate([line_ends, marks]))
+    first_word = np.searchsorted(starts, field_starts)
+    last_word = np.searchsorted(ends, field_ends, side="right") - 1
+    full = first_word <= last_word
+    token_starts, token_ends = field_ends.copy(), field_ends.copy()
+    token_starts[full] = starts[first_word[full]]
+    token_ends[full] = ends[last_word[full]]
+    first = np.searchsorted(field_starts, line_starts)
+    return token_starts, token_ends, first, np.searchsorted(field_starts, line_ends, side="right")
+
+
+def as_numbers(raw: bytes, starts: _Offsets, ends: _Offsets) -> tuple[npt.NDArray[np.float64], int | None]:
+    """Read (K,) tokens as float64; also return the index of the first that is no number, or None."""
+    values = np.full(len(starts), np.nan)
+    for begin, chunk in _texts(raw, starts, ends):
+        bad = _parse(chunk, values[begin : begin + len(chunk)])
+        if bad is not None:
+            return values, begin + bad
+    return values, None
+
+
+def as_integers(
+    raw: bytes, starts: _Offsets, ends: _Offsets, dtype: np.dtype[Any]
+) -> tuple[npt.NDArray[Any], int | None]:
+    """Read (K,) tokens as whole numbers that fit into `dtype`; also return the index of the first that does not."""
+    values, bad = as_numbers(raw, starts, ends)
+    limits = np.iinfo(dtype)
+    if bad is None:
+        fits = (values >= limits.min) & (values <= limits.max) & (values == np.floor(values))
+        bad = None if fits.all() else int(np.argmin(fits))
+    if bad is not None:
+        return np.zeros(len(starts), dtype), bad
+    if dtype.itemsize < 8:
+        return values.astype(dtype), None
+    # float64 is too short for 64 bits
+    tokens = (raw[start:end].lower() for start, end in zip(starts.tolist(), ends.tolist(), strict=True))
+    exact = [int(float(token)) if b"." in token or b"e" in token else int(token) for token in tokens]
+    outside = next((row for row, value in enumerate(exact) if not limits.min <= value <= limits.max), None)
+    if outside is not None:
+        return np.zeros(len(starts), dtype), outside
+    return np.array(exact, dtype), None
+
+
+def _texts(raw: bytes, starts: _Offsets, ends: _Offsets) -> Iterator[tuple[int, npt.NDArray[Any]]]:
+    """Yield (first index, (k,) fixed-width byte strings); a token that is too long for a number comes out as `?`."""
+    text = np.frombuffer(raw, np.uint8)
+    step = 1 << 16
+    for begin in range(0, len(starts), step):
+        at = starts[begin : begin + step]
+        length = ends[begin : begin + step] - at
+        length = np.where(length > MAX_NUMBER_CHARACTERS, 0, length)
+        width = max(int(length.max()), 1)
+        column = np.arange(width)
+        index = np.minimum(at[:, None] + column, max(len(text) - 1, 0))
+        characters = np.where(column < length[:, None], text[index], 0).astype(np.uint8)
+        characters[length == 0, 0] = ord("?")
+        characters[~_IN_NUMBER[characters].all(axis=1), 0] = ord("?")
+        yield begin, characters.view(f"S{width}").reshape(len(at))
+
+
+def _parse(texts: npt.NDArray[Any], out: npt.NDArray[np.float64]) -> int | None:
+    try:
+        out[:] = texts.astype(np.float64)
+    except ValueError:
+        pass
+    else:
+        return None
+    for row, token in enumerate(texts.tolist()):
+        try:
+            out[row] = float(token)
+        except ValueError:
+            return row
+    return None
+
+
+def replaced(
+    raw: bytes,
+    starts: _Offsets,
+    ends: _Offsets,
+    new: npt.NDArray[np.float64],
+    old: npt.NDArray[np.float64],
+) -> bytes:
+    """Return `raw` with the tokens of the moved coordinates rewritten; starts, ends: (N, 3) byte offsets."""
+    changed = moved(new, old)
+    begins, stops, texts = starts[changed], ends[changed], new[changed]
+    order = np.argsort(begins, kind="stable")
+    begins, stops, words = begins[order], stops[order], number_text(texts[order])
+    pieces: list[bytes] = [b""] * (2 * len(words) + 1)
+    pieces[1::2] = words
+    kept_from, kept_to = [0, *stops.tolist()], [*begins.tolist(), len(raw)]
+    pieces[0::2] = [raw[start:stop] for start, stop in zip(kept_from, kept_to, strict=True)]
+    return b"".join(pieces)
+
+
+def shown(token: bytes) -> str:
+    """Return a token as an error message may show it."""
+    text = token[:40].decode("ascii", "backslashreplace")
+    return repr(text + "…" if len(token) > 40 else text)
+
+
+def refuse_binary(raw: bytes, begin: int) -> None:
+    """Raise MalformedFile where a text file holds a zero byte."""
+    at = raw.find(b"\0", begin)
+    if at >= 0:
+        raise MalformedFile(f"byte {at} is 0x00: this is no text file")
