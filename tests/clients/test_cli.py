@@ -17,7 +17,7 @@ from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, Interna
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
 
-POINTS = 1200
+POINTS = 400
 
 
 def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

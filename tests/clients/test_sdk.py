@@ -32,7 +32,7 @@ from straightpcf.points.errors import (
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
 
-POINTS = 1200
+POINTS = 400
 
 
 @pytest.fixture

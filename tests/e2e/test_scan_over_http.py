@@ -73,6 +73,7 @@ def test_curl_gives_the_same_points_in_the_same_order_with_the_same_other_fields
     )
 
 
+@pytest.mark.parametrize("scan", ["binary_little_endian"], indirect=True)
 def test_the_command_line_the_sdk_and_curl_give_the_same_bytes(
     server: RunningServer, scan: Path, tmp_path: Path
 ) -> None:

@@ -23,7 +23,7 @@ from straightpcf.service.api.errors import STATUS_BY_CODE
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
 
-POINTS = 1500
+POINTS = 400
 
 
 class Answer(NamedTuple):
@@ -120,11 +120,11 @@ def test_strength_zero_gives_the_input_back(server: RunningServer, cloud: Path) 
 
 def test_rows_that_are_not_finite_pass_through(server: RunningServer, tmp_path: Path) -> None:
     xyz = noisy(torus(POINTS), 0.01)
-    xyz[[3, 700]] = np.nan, np.inf
+    xyz[3], xyz[399] = np.nan, np.inf
     np.save(path := tmp_path / "holes.npy", xyz)
     answer = curl("-F", f"file=@{path}", "-F", "iterations=1", f"{server.url}/denoise")
     assert answer.headers["x-untouched"] == "2"
-    np.testing.assert_array_equal(load(answer)[[3, 700]], xyz[[3, 700]])
+    np.testing.assert_array_equal(load(answer)[[3, 399]], xyz[[3, 399]])
 
 
 def _npy(xyz: np.ndarray[Any, Any]) -> bytes:
