@@ -11,6 +11,7 @@ from straightpcf.points.formats.base import DEFAULT_MAX_POINTS, Format
 from straightpcf.points.formats.npy import Npy
 from straightpcf.points.formats.npz import Npz
 from straightpcf.points.formats.ply import Ply
+from straightpcf.points.formats.xyz import Xyz
 
 __all__ = [
     "DEFAULT_MAX_POINTS",
@@ -22,7 +23,7 @@ __all__ = [
     "write_cloud",
 ]
 
-FORMATS: tuple[Format, ...] = (Ply(), Npy(), Npz())
+FORMATS: tuple[Format, ...] = (Ply(), Xyz(), Npy(), Npz())
 
 _WITHOUT_MAGIC = ("xyz", "kitti")  # recognised by the suffix alone
 _HEAD_BYTES = 4096

@@ -1,174 +1,192 @@
-"""NPZ: a zip of arrays, one of them the positions; no member is unpacked before its declared size is known."""
+"""NPZ: one array of positions among others; the others are kept, and a zip bomb is refused unread."""
 
 from __future__ import annotations
 
-import io
 import zipfile
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyBytes, UnsupportedCloud
-from straightpcf.points.formats.base import Format, check_count, check_room
-from straightpcf.points.formats.npy import (
-    ArrayHeader,
-    NpySource,
-    array_bytes,
-    array_of,
-    check_positions,
-    npy_source,
+from straightpcf.points.formats.base import Format
+from straightpcf.points.formats.npy_array import (
+    HEADER_BYTES,
+    MAGIC,
+    NpyHeader,
     patched,
-    read_array_header,
+    positions_header,
+    read_header,
+    view,
 )
 from straightpcf.points.formats.positions import moved
 from straightpcf.points.formats.scalars import further_columns
 
-__all__ = ["MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
+__all__ = ["KEYS", "MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
 
+KEYS = ("points", "xyz", "pos")
+MAX_MEMBERS = 1000
 MAX_UNPACKED_BYTES = 4 << 30
-MAX_MEMBERS = 10_000
-POSITION_KEYS = ("points", "xyz", "pos")
 _COPY_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class NpzSource:
-    """Hold the zip as it was, and the member with the positions."""
+    """Hold the archive as it is packed, and which member is the cloud: its name, NPY bytes, header and positions."""
 
     raw: bytes
     member: str
-    positions: NpySource
+    array: bytes
+    header: NpyHeader
+    xyz: npt.NDArray[np.float64]
 
 
 class Npz(Format):
-    """Read and write positions under `points`, `xyz`, `pos`, or as the only (N, M >= 3) float array."""
+    """Read and write NPZ; the positions are the array `points`, `xyz` or `pos`, or the only (N, >= 3) float array."""
 
     name = "npz"
     suffixes = (".npz",)
+    media_type = "application/x-npz"
 
     def sniff(self, head: bytes) -> bool:
-        """Recognise a zip file."""
+        """Recognise a zip archive."""
         return head[:4] in (b"PK\x03\x04", b"PK\x05\x06")
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read the positions; other arrays with a row a point become attributes. Nothing is ever unpickled."""
+        """Read the positions; what the archive's directory declares is checked before anything is unpacked."""
         raw = path.read_bytes()
-        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            headers = _headers(archive)
-            member = _position_member(headers)
-            check_positions(headers[member], f"array {_key(member)}")
-            check_count(headers[member].shape[0], max_points, f"array {_key(member)}")
-            positions = npy_source(_unpacked(archive, member), f"array {_key(member)}", max_points)
-            attributes = further_columns(array_of(positions.raw, positions.header))
-            for name in _attribute_members(headers, member):
-                attributes[_key(name)] = array_of(_unpacked(archive, name), headers[name])
-        return PointCloud(positions.xyz.copy(), attributes, NpzSource(raw, member, positions))
+        with _opened(raw) as archive:
+            members = _members(archive)
+            member = _choose(archive, members)
+            where = f"array {member.filename[:80]}"
+            header = positions_header(_head(archive, member), where=where, max_points=max_points)
+            array = _unpacked(archive, member, header)
+            rows = view(array, header)
+            xyz = rows[:, :3].astype(np.float64, order="C")
+            attributes = further_columns(rows)
+            for other in members:
+                head = b"" if other is member else _head(archive, other)
+                if not head.startswith(MAGIC):
+                    continue
+                found = read_header(head, where=f"array {other.filename[:80]}")
+                if found.is_attribute_of(len(xyz)):
+                    attributes[_key(other)] = view(_unpacked(archive, other, found), found)
+        return PointCloud(xyz, attributes, NpzSource(raw, member.filename, array, header, xyz.copy()))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
-        """Write the zip that was read with its positions replaced, or a new one: `points` and every attribute."""
+        """Write the archive that was read with its positions replaced; a cloud of another format as `points` and more.
+
+        The attributes of another format become arrays of their own.
+        """
         source = cloud.source
         if not isinstance(source, NpzSource):
             _write_new(cloud, path)
-        elif moved(cloud.xyz, source.positions.xyz).any():
-            _write_patched(source, cloud.xyz, path)
-        else:
+        elif not moved(cloud.xyz, source.xyz).any():
             path.write_bytes(source.raw)
+        else:
+            _rewrite(source, cloud.xyz, path)
 
 
-def _headers(archive: zipfile.ZipFile) -> dict[str, ArrayHeader]:
-    """Read the header of every array; only declared sizes and first bytes are looked at."""
+@contextmanager
+def _opened(raw: bytes) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; what zipfile and zlib find wrong with it becomes MalformedFile, here and only here."""
+    try:
+        with zipfile.ZipFile(BytesIO(raw)) as archive:
+            yield archive
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, RuntimeError, ValueError) as exc:
+        raise MalformedFile(f"the NPZ archive is broken: {exc}") from exc
+
+
+def _members(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Check the central directory, and return its arrays."""
     members = archive.infolist()
     if len(members) > MAX_MEMBERS:
-        raise TooManyBytes(f"the NPZ file has {len(members)} members; the limit is {MAX_MEMBERS}")
+        raise TooManyBytes(f"the NPZ archive has {len(members)} members; the limit is {MAX_MEMBERS}")
     total = sum(member.file_size for member in members)
     if total > MAX_UNPACKED_BYTES:
-        raise TooManyBytes(f"the NPZ file declares {total} unpacked bytes; the limit is {MAX_UNPACKED_BYTES}")
-    headers: dict[str, ArrayHeader] = {}
+        raise TooManyBytes(f"the NPZ archive declares {total} bytes unpacked; the limit is {MAX_UNPACKED_BYTES}")
+    if len({member.filename for member in members}) != len(members):
+        raise MalformedFile("the NPZ archive has two members of one name")
     for member in members:
-        if not member.filename.endswith(".npy"):
-            continue
-        where = f"array {_key(member.filename)}"
-        if member.filename in headers:
-            raise MalformedFile(f"{where} is in the NPZ file twice")
-        with archive.open(member) as file:
-            header = read_array_header(file, where)
-        if not header.dtype.hasobject:
-            check_room(header.size + header.data_bytes, member.file_size, what=f"{where} of shape {header.shape}")
-        headers[member.filename] = header
-    return headers
+        name = member.filename[:80]
+        if member.flag_bits & 1:
+            raise UnsupportedCloud(f"member {name} of the NPZ archive is encrypted")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise UnsupportedCloud(f"member {name} of the NPZ archive is packed with method {member.compress_type}")
+    return [member for member in members if member.filename.endswith(".npy")]
 
 
-def _position_member(headers: dict[str, ArrayHeader]) -> str:
-    for key in POSITION_KEYS:
-        if f"{key}.npy" in headers:
-            return f"{key}.npy"
-    fitting = [name for name, header in headers.items() if _could_be_positions(header)]
-    if len(fitting) == 1:
-        return fitting[0]
-    listed = ", ".join(f"{_key(name)} {header.shape}" for name, header in headers.items())[:300] or "none"
-    raise UnsupportedCloud(
-        f"the NPZ file has no array named {', '.join(POSITION_KEYS)}, and {len(fitting)} of its arrays "
-        f"are (N, 3) floats or wider; its arrays are: {listed}"
-    )
+def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
+    by_name = {member.filename: member for member in members}
+    for key in KEYS:
+        if f"{key}.npy" in by_name:
+            return by_name[f"{key}.npy"]
+    fitting = []
+    for member in members:
+        head = _head(archive, member)
+        if head.startswith(MAGIC) and read_header(head, where=f"array {member.filename[:80]}").is_positions:
+            fitting.append(member)
+    if len(fitting) != 1:
+        names = ", ".join(_key(member) for member in (fitting or members))[:200]
+        raise UnsupportedCloud(
+            f"the NPZ archive has {len(fitting)} arrays of shape (N, >= 3), and none named {', '.join(KEYS)}: "
+            f"{names or 'no arrays at all'}"
+        )
+    return fitting[0]
 
 
-def _could_be_positions(header: ArrayHeader) -> bool:
-    return header.dtype.kind == "f" and len(header.shape) == 2 and header.shape[1] >= 3
-
-
-def _attribute_members(headers: dict[str, ArrayHeader], positions: str) -> Iterator[str]:
-    count = headers[positions].shape[0]
-    for name, header in headers.items():
-        has_row_a_point = len(header.shape) in (1, 2) and header.shape[0] == count
-        if name != positions and has_row_a_point and not header.dtype.hasobject:
-            yield name
-
-
-def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
-    member = archive.getinfo(name)
+def _head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     with archive.open(member) as file:
-        raw = file.read(member.file_size + 1)
-    if len(raw) != member.file_size:
-        raise MalformedFile(f"{_key(name)} unpacks to {len(raw)} bytes, not the {member.file_size} it declares")
-    return raw
+        return file.read(HEADER_BYTES)
 
 
-def _write_patched(source: NpzSource, xyz: npt.NDArray[np.float64], path: Path) -> None:
-    with zipfile.ZipFile(io.BytesIO(source.raw)) as old, zipfile.ZipFile(path, "w") as new:
+def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo, header: NpyHeader) -> bytes:
+    """Unpack an array whose shape and declared size agree."""
+    where, size = f"array {member.filename[:80]}", header.size + header.data_bytes
+    if size != member.file_size:
+        raise MalformedFile(f"{where} of shape {header.shape} needs {size} bytes, it has {member.file_size}")
+    with archive.open(member) as file:
+        array = file.read(size + 1)
+    if len(array) != size:
+        raise MalformedFile(f"{where} unpacks to {len(array)} bytes, {size} are declared")
+    return array
+
+
+def _key(member: zipfile.ZipInfo) -> str:
+    return member.filename.removesuffix(".npy")
+
+
+def _rewrite(source: NpzSource, xyz: npt.NDArray[np.float64], path: Path) -> None:
+    with _opened(source.raw) as old, zipfile.ZipFile(path, "w") as new:
         new.comment = old.comment
         for member in old.infolist():
-            with new.open(_copied(member), "w", force_zip64=member.file_size >= 1 << 30) as target:
+            info = zipfile.ZipInfo(member.filename, member.date_time)
+            info.compress_type, info.external_attr = member.compress_type, member.external_attr
+            info.comment, info.create_system = member.comment, member.create_system
+            info.file_size = member.file_size
+            with new.open(info, "w") as target:
                 if member.filename == source.member:
-                    target.write(patched(source.positions, xyz))
+                    target.write(patched(source.array, source.header, xyz, source.xyz))
                     continue
-                with old.open(member) as file:
-                    while chunk := file.read(_COPY_BYTES):
-                        target.write(chunk)
-
-
-def _copied(member: zipfile.ZipInfo) -> zipfile.ZipInfo:
-    copy = zipfile.ZipInfo(member.filename, member.date_time)
-    copy.compress_type, copy.external_attr, copy.comment = member.compress_type, member.external_attr, member.comment
-    copy.create_system = member.create_system
-    return copy
+                with old.open(member) as kept:
+                    while block := kept.read(_COPY_BYTES):
+                        target.write(block)
 
 
 def _write_new(cloud: PointCloud, path: Path) -> None:
-    """Write with a fixed date, so that the same cloud gives the same bytes."""
-    arrays: dict[str, npt.NDArray[Any]] = {"points": cloud.xyz}
-    arrays |= {name.replace("/", "_"): values for name, values in cloud.attributes.items() if name != "points"}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for key, values in arrays.items():
-            info = zipfile.ZipInfo(f"{key}.npy")
-            info.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(info, "w", force_zip64=values.nbytes >= 1 << 30) as target:
-                target.write(array_bytes(values))
-
-
-def _key(member: str) -> str:
-    return member.removesuffix(".npy")[:80]
+        arrays = {"points": np.ascontiguousarray(cloud.xyz)}
+        for name, values in cloud.attributes.items():
+            if name not in KEYS and "/" not in name and not values.dtype.hasobject:
+                arrays[name] = np.ascontiguousarray(values)
+        for name, values in arrays.items():
+            info = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: the same cloud gives the same bytes
+            info.compress_type, info.file_size = zipfile.ZIP_DEFLATED, values.nbytes + HEADER_BYTES
+            with archive.open(info, "w") as file:
+                np.lib.format.write_array(file, values, allow_pickle=False)

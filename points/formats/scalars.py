@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -25,7 +26,7 @@ def scalar_columns(
     for name, values in attributes.items():
         if values.dtype.kind not in "biuf":
             continue
-        parts = values.reshape(len(values), -1).T if values.ndim > 1 else values[None]
+        parts = values.reshape(len(values), math.prod(values.shape[1:])).T
         for index, part in enumerate(parts):
             kind = part.dtype.str[1:]
             wide = kind if kind in types else _WIDER.get(kind, "f8")

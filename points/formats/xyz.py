@@ -1,0 +1,215 @@
+"""XYZ: one point a line of text, as scanners, spreadsheets and `.pts` files have it; only moved tokens change."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.positions import AXES
+from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.text import Lines, as_numbers, blocks, refuse_binary, replaced, shown
+
+__all__ = ["MAX_COLUMNS", "Xyz"]
+
+MAX_COLUMNS = 4096
+_COMMENTS = (b"#", b"//")
+_BOM = b"\xef\xbb\xbf"
+_LINE_END = re.compile(rb"\r\n|\n|\r")
+_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+_Offsets = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Describe the table; begin, line: byte offset and line number of its first line.  axes: the columns of x, y, z.
+
+    declared: the number of points if a line of its own says it, as in `.pts`.  delimiter: None for white space.
+    """
+
+    begin: int
+    line: int
+    declared: int | None
+    delimiter: bytes | None
+    names: tuple[str, ...]
+    axes: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class XyzSource:
+    """Hold the whole file, the (N, 3) byte offsets of its position tokens, and the positions read from them."""
+
+    raw: bytes
+    starts: _Offsets
+    ends: _Offsets
+    xyz: npt.NDArray[np.float64]
+
+
+class Xyz(Format):
+    """Read and write text tables of at least three columns between white space, commas or semicolons.
+
+    x, y, z are the first three columns, unless a line of names above the table says which they are. Comment lines
+    (`#`, `//`), blank lines, a line with the number of points and columns of any text are kept.
+    """
+
+    name = "xyz"
+    suffixes = (".xyz", ".txt", ".asc", ".csv", ".pts")
+    media_type = "text/plain"
+
+    def sniff(self, head: bytes) -> bool:
+        """Recognise nothing: text has no magic, its suffix says what it is."""
+        return False
+
+    def read(self, path: Path, *, max_points: int) -> PointCloud:
+        """Read the table; further columns that hold numbers become float64 attributes."""
+        raw = path.read_bytes()
+        refuse_binary(raw, 0)
+        layout = _layout(raw)
+        if layout.declared is not None:
+            check_count(layout.declared, max_points, f"line {layout.line - 1}")
+        starts, ends, columns = _table(raw, layout, max_points)
+        if layout.declared not in (None, len(starts)):
+            raise MalformedFile(f"the file declares {layout.declared} points and holds {len(starts)}")
+        xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
+        attributes = {layout.names[column]: values for column, values in columns.items()}
+        return PointCloud(xyz, attributes, XyzSource(raw, starts, ends, xyz.copy()))
+
+    def write(self, cloud: PointCloud, path: Path) -> None:
+        """Write the file that was read with the moved positions replaced, or a new one."""
+        source = cloud.source
+        if isinstance(source, XyzSource):
+            path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
+        else:
+            path.write_bytes(_new_file(cloud, path.suffix.lower()))
+
+
+def _layout(raw: bytes) -> Layout:
+    """Read what stands above the table, up to the first line that is neither blank, comment, count nor names."""
+    at, line = len(_BOM) if raw.startswith(_BOM) else 0, 1
+    declared: int | None = None
+    names: bytes | None = None
+    remark = b""
+    while at < len(raw):
+        found = _LINE_END.search(raw, at)
+        end = found.end() if found else len(raw)
+        text = raw[at:end].strip()
+        if text.startswith(_COMMENTS):
+            remark = text.lstrip(b"#/ ")
+        elif text and declared is None and names is None and text.isdigit() and len(text) <= 18:
+            declared = int(text)
+        elif text and names is None and _are_names(_words(text)):
+            names = text
+        elif text:
+            return _described(at, line, declared, text, names, remark)
+        at, line = end, line + 1
+    return Layout(len(raw), line, declared, None, ("x", "y", "z"), (0, 1, 2))
+
+
+def _described(begin: int, line: int, declared: int | None, row: bytes, names: bytes | None, remark: bytes) -> Layout:
+    columns = len(_words(row))
+    if columns < 3:
+        raise MalformedFile(f"line {line} has {columns} columns, a point needs three: {shown(row)}")
+    if columns > MAX_COLUMNS:
+        raise UnsupportedCloud(f"line {line} has {columns} columns; the limit is {MAX_COLUMNS}")
+    labels = [f"column_{column + 1}" for column in range(columns)]
+    axes = (0, 1, 2)
+    for text in (names, remark):
+        words = [word.strip(b"\"' ").decode("utf-8", "replace")[:80] for word in _words(text or b"")]
+        lower = [word.lower() for word in words]
+        is_title = len(words) == columns and len(set(words)) == columns and "" not in words
+        if is_title and all(lower.count(axis) == 1 for axis in AXES):
+            labels, axes = words, (lower.index("x"), lower.index("y"), lower.index("z"))
+            break
+    return Layout(begin, line, declared, _delimiter(row), tuple(labels), axes)
+
+
+def _delimiter(row: bytes) -> bytes | None:
+    return next((mark for mark in (b";", b",") if mark in row), None)
+
+
+def _words(row: bytes) -> list[bytes]:
+    return [word.strip() for word in row.split(_delimiter(row))] if row else []
+
+
+def _are_names(words: Sequence[bytes]) -> bool:
+    return len(words) >= 3 and not any(_is_number(word) for word in words)
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _table(
+    raw: bytes, layout: Layout, max_points: int
+) -> tuple[_Offsets, _Offsets, dict[int, npt.NDArray[np.float64]]]:
+    """Return the (N, 3) starts and ends of the position tokens, and every column that holds only numbers."""
+    starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+    parts: dict[int, list[npt.NDArray[np.float64]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
+    line, count = layout.line, 0
+    for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter):
+        rows = np.flatnonzero(_is_row(lines))
+        table, numbers = lines.pick(rows), line + rows
+        line, count = line + len(lines), count + len(rows)
+        check_count(count, max_points, "the file")
+        _check_columns(table, numbers, len(layout.names))
+        for column in list(parts):
+            token = table.first + column
+            values, bad = as_numbers(raw, table.starts[token], table.ends[token])
+            if bad is None:
+                parts[column].append(values)
+            elif column in layout.axes:
+                text = raw[table.starts[token[bad]] : table.ends[token[bad]]]
+                raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number")
+            else:
+                del parts[column]  # a column of text: it stays in the file
+        tokens = table.first[:, None] + np.array(layout.axes)
+        starts.append(table.starts[tokens])
+        ends.append(table.ends[tokens])
+    columns = {column: np.concatenate(values) for column, values in parts.items()}
+    return np.concatenate(starts), np.concatenate(ends), columns
+
+
+def _is_row(lines: Lines) -> npt.NDArray[np.bool_]:
+    """Return (L,) bool: which lines are neither blank nor comments."""
+    is_row: npt.NDArray[np.bool_] = lines.counts > 0
+    text = np.frombuffer(lines.raw, np.uint8)
+    at = lines.starts[lines.first[is_row]]
+    following = text[np.minimum(at + 1, len(text) - 1)]
+    is_row[is_row] = (text[at] != ord("#")) & ~((text[at] == ord("/")) & (following == ord("/")))
+    return is_row
+
+
+def _check_columns(table: Lines, numbers: npt.NDArray[np.int64], columns: int) -> None:
+    wrong = table.counts != columns
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise MalformedFile(f"line {numbers[row]} has {table.counts[row]} columns, the lines before have {columns}")
+
+
+def _new_file(cloud: PointCloud, suffix: str) -> bytes:
+    """Write x, y, z and every numeric attribute; their names stand above if there are any."""
+    columns: dict[str, npt.NDArray[Any]] = {axis: cloud.xyz[:, index] for index, axis in enumerate(AXES)}
+    columns |= scalar_columns(cloud.attributes, _TYPES, taken=AXES)
+    separator = "," if suffix == ".csv" else " "
+    lines: list[str] = [str(len(cloud))] if suffix == ".pts" else []
+    if len(columns) > 3:
+        lines.append(("" if suffix == ".csv" else "# ") + separator.join(columns))
+    lines += map(separator.join, zip(*(_texts(values) for values in columns.values()), strict=True))
+    return "\n".join([*lines, ""]).encode() if lines else b""
+
+
+def _texts(values: npt.NDArray[Any]) -> list[str]:
+    """Write (N,) numbers as the shortest texts that read back as the same numbers of their type."""
+    return values.astype(str).tolist() if values.dtype == np.float32 else list(map(repr, values.tolist()))
