@@ -8,9 +8,9 @@ ARG TORCH=cpu
 RUN apt-get update \
     && apt-get install -y --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
-RUN python -m venv /venv
 # The public index serves CUDA builds of torch, PyTorch's own the CPU build.
-RUN if [ "$TORCH" = cpu ]; then \
+RUN python -m venv /venv \
+    && if [ "$TORCH" = cpu ]; then \
         /venv/bin/pip install --no-cache-dir "torch>=2.6,<2.14" --index-url https://download.pytorch.org/whl/cpu; \
     fi
 WORKDIR /source
@@ -31,7 +31,7 @@ LABEL org.opencontainers.image.title="straightpcf" \
 RUN useradd --create-home --uid 10001 straightpcf \
     && install -d -o straightpcf /data
 COPY --from=build /venv /venv
-USER straightpcf
+USER 10001
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     STRAIGHTPCF_DATA_DIR=/data
