@@ -9,9 +9,10 @@ from typing import ClassVar
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyPoints
 
-__all__ = ["DEFAULT_MAX_POINTS", "Format", "check_count", "check_room"]
+__all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room"]
 
 DEFAULT_MAX_POINTS = 100_000_000
+HEAD_BYTES = 4096  # what `sniff` sees of a file
 
 
 class Format(ABC):
@@ -24,6 +25,7 @@ class Format(ABC):
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]
     media_type: ClassVar[str] = "application/octet-stream"
+    has_magic: ClassVar[bool] = True  # False: only the file's suffix says what it is
 
     @abstractmethod
     def sniff(self, head: bytes) -> bool:

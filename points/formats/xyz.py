@@ -63,6 +63,7 @@ class Xyz(Format):
     name = "xyz"
     suffixes = (".xyz", ".txt", ".asc", ".csv", ".pts")
     media_type = "text/plain"
+    has_magic = False
 
     def sniff(self, head: bytes) -> bool:
         """Recognise nothing: text has no magic, its suffix says what it is."""
