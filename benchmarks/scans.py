@@ -180,7 +180,7 @@ def _flat_crop(xyz: Floats) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
         index = tree.query(xyz[seed], k=min(CROP_POINTS, len(xyz)))[1]
         centre = np.median(xyz[index], axis=0)
         spread, axes = np.linalg.eigh(np.cov((xyz[index] - centre).T))
-        score = spread[1] / spread[2] - 20 * max(0.0, spread[0] / max(spread[1], 1e-300) - 0.01)
+        score = spread[1] / max(spread[2], 1e-300) - 20 * max(0.0, spread[0] / max(spread[1], 1e-300) - 0.01)
         if score > best[0]:
             best = (score, (index, axes, centre))
     return best[1]  # type: ignore[no-any-return]
