@@ -136,3 +136,20 @@ def test_doctor_tells_what_is_here() -> None:
     findings = json.loads(done.stdout)
     assert {"python", "extras"} <= set(findings)
     assert done.exit_code == (4 if "problem" in findings else 0)
+
+
+def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    data, run = tmp_path / "shapes.npz", tmp_path / "run"
+    np.savez(data, **{f"shape{i:02d}/1500": torus(1500, i).astype(np.float32) for i in range(11)})
+    for iterations in ("1", "2"):
+        done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", iterations, "--batch-size", "2")
+        assert done.returncode == 0, done.stderr
+    rows = (run / "log.csv").read_text().splitlines()
+    assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
+
+
+def test_a_stage_without_the_one_before_is_a_usage_error(tmp_path: Path) -> None:
+    np.savez(data := tmp_path / "shapes.npz", **{"a/1500": torus(1500).astype(np.float32)})
+    done = cli("train", "cvm", "--data", data, "--run-dir", tmp_path / "run")
+    assert done.returncode == 2
+    assert "init" in done.stderr
