@@ -1,0 +1,164 @@
+"""PLY as other programs write and break it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plyfile
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import InvalidCloud, MalformedFile, TooManyPoints, UnsupportedCloud
+from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from tests.clouds import torus
+from tests.points.samples import SAMPLES
+
+AXES = ["property float x", "property float y", "property float z"]
+BINARY, ASCII = "format binary_little_endian 1.0", "format ascii 1.0"
+
+
+def header(*lines: str) -> bytes:
+    return "\n".join(["ply", *lines, "end_header", ""]).encode()
+
+
+def read(folder: Path, raw: bytes, **options: Any) -> PointCloud:
+    (path := folder / "a.ply").write_bytes(raw)
+    return read_cloud(path, **options)[0]
+
+
+def written(folder: Path, cloud: PointCloud) -> bytes:
+    write_cloud(cloud, folder / "out.ply", format_named("ply"))
+    return (folder / "out.ply").read_bytes()
+
+
+@pytest.mark.parametrize("sample", [name for name in SAMPLES if name.startswith("ply")])
+def test_plyfile_reads_the_same_positions_before_and_after(sample: str, tmp_path: Path) -> None:
+    path = SAMPLES[sample](tmp_path)
+    cloud = read_cloud(path)[0]
+    for raw, xyz in (
+        (path.read_bytes(), cloud.xyz),
+        (written(tmp_path, cloud.with_xyz(cloud.xyz + 0.5)), cloud.xyz + 0.5),
+    ):
+        head, body = raw.split(b"end_header", 1)
+        ascii_head = bytes(byte if byte < 128 else ord(".") for byte in head)  # plyfile takes ASCII comments only
+        vertex = plyfile.PlyData.read(io.BytesIO(ascii_head + b"end_header" + body))["vertex"]
+        np.testing.assert_allclose(np.stack([vertex[axis] for axis in "xyz"], axis=1), xyz, atol=1e-6)
+
+
+def test_only_the_moved_bytes_of_a_binary_file_differ(tmp_path: Path) -> None:
+    raw = header(BINARY, "element vertex 50", *AXES, "property uchar red") + np.random.default_rng(0).bytes(50 * 13)
+    cloud = read(tmp_path, raw)
+    xyz = cloud.xyz.copy()
+    xyz[7, 1] = 3.0
+    at = len(raw) - 50 * 13 + 7 * 13 + 4
+    assert written(tmp_path, cloud.with_xyz(xyz)) == raw[:at] + np.float32(3).tobytes() + raw[at + 4 :]
+
+
+def test_only_the_moved_tokens_of_a_text_file_differ(tmp_path: Path) -> None:
+    raw = header(ASCII, "comment  kept ", "element vertex 2", *AXES) + b"1.000 2e0\t+3\r\n 4 5.50 NaN\r\n"
+    cloud = read(tmp_path, raw)
+    xyz = cloud.xyz.copy()
+    xyz[0, 1] = 0.1
+    assert written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"2e0", b"0.1")
+
+
+def test_nan_bits_negative_zero_and_trailing_bytes_are_kept(tmp_path: Path) -> None:
+    body = np.array([0x7FC12345, 0x80000000, 0x7F800000, 0, 0, 0], "<u4").tobytes() + b"tail"
+    raw = header(BINARY, "element vertex 2", *AXES) + body
+    cloud = read(tmp_path, raw)
+    xyz = cloud.xyz.copy()
+    xyz[1] = 1.0
+    assert written(tmp_path, cloud.with_xyz(xyz))[: -4 - 12] == raw[: -4 - 12]
+    assert written(tmp_path, cloud.with_xyz(xyz)).endswith(np.ones(3, "<f4").tobytes() + b"tail")
+
+
+def test_elements_before_the_vertices_are_kept(tmp_path: Path) -> None:
+    lists = b"".join(bytes([n]) + np.arange(n, dtype=">i4").tobytes() for n in (0, 3, 1))
+    xyz = torus(5).astype(">f8")
+    raw = header(
+        "format binary_big_endian 1.0",
+        "element strip 3",
+        "property list uchar int row",
+        "element vertex 5",
+        *(line.replace("float", "double") for line in AXES),
+    )
+    cloud = read(tmp_path, raw + lists + xyz.tobytes())
+    np.testing.assert_array_equal(cloud.xyz, xyz)
+    assert written(tmp_path, cloud.with_xyz(cloud.xyz + 1)) == raw + lists + (xyz + 1).astype(">f8").tobytes()
+
+
+def test_a_new_file_has_double_positions_and_its_attributes_typed(tmp_path: Path) -> None:
+    xyz = np.add(torus(9), [500_000.123456, 5_400_000.0, 0.0])
+    cloud = PointCloud(
+        xyz, {"normal": np.ones((9, 3), np.float32), "my label": np.arange(9), "text": np.array(["a"] * 9)}
+    )
+    vertex = plyfile.PlyData.read(io.BytesIO(written(tmp_path, cloud)))["vertex"]
+    np.testing.assert_array_equal(np.stack([vertex[axis] for axis in "xyz"], axis=1), xyz)
+    assert vertex["normal_2"].dtype == np.float32
+    np.testing.assert_array_equal(vertex["my_label"], np.arange(9))
+
+
+VERTICES = ("element vertex 4", *AXES)
+MALFORMED: dict[str, tuple[bytes, type[InvalidCloud], str]] = {
+    "no end of header": (b"ply\nformat ascii 1.0\n", MalformedFile, "end_header"),
+    "an endless line": (b"ply\ncomment " + b"a" * 5_000_000, MalformedFile, "line 2 .* 65536"),
+    "an endless header": (b"ply\n" + b"comment a\n" * 200_000, MalformedFile, "1048576"),
+    "no format": (header(*VERTICES), MalformedFile, "line 2"),
+    "unknown format": (header("format ascii 2.0", *VERTICES), MalformedFile, "line 2"),
+    "no vertex": (header(ASCII, "element face 0"), MalformedFile, "no element vertex"),
+    "no z": (header(ASCII, "element vertex 0", *AXES[:2]), MalformedFile, "no property z"),
+    "list z": (header(ASCII, "element vertex 0", *AXES[:2], "property list int float z"), UnsupportedCloud, "a list"),
+    "integer z": (header(ASCII, "element vertex 0", *AXES[:2], "property short z"), UnsupportedCloud, "int16"),
+    "unknown type": (header(ASCII, "element vertex 0", "property half x"), MalformedFile, "line 4.*half"),
+    "property twice": (header(ASCII, "element vertex 0", AXES[0], AXES[0]), MalformedFile, "line 5.*x.*twice"),
+    "element twice": (header(ASCII, "element vertex 0", "element vertex 0"), MalformedFile, "line 4.*twice"),
+    "negative count": (header(ASCII, "element vertex -4", *AXES), MalformedFile, "line 3.*-4"),
+    "no number": (header(ASCII, "element vertex many", *AXES), MalformedFile, "line 3.*many"),
+    "huge number": (header(ASCII, f"element vertex {10**30}", *AXES), MalformedFile, "line 3"),
+    "truncated": (header(BINARY, *VERTICES) + bytes(47), MalformedFile, "48 bytes.* 47"),
+    "truncated text": (header(ASCII, *VERTICES) + b"0 0 0\n" * 3, MalformedFile, "4 rows"),
+    "short row": (header(ASCII, *VERTICES) + b"0 0 0\n0 0\n0 0 0\n0 0 0\n0\n", MalformedFile, "line 9.* 2 values"),
+    "long row": (header(ASCII, *VERTICES) + b"0 0 0 0\n" * 4, MalformedFile, "line 8.* 4 values"),
+    "bad token": (header(ASCII, *VERTICES) + b"0 0 0\n0 0 1,5\n0 0 0\n0 0 0\n", MalformedFile, "line 9.*1,5"),
+    "list bomb": (
+        header(BINARY, "element vertex 1", *AXES, "property list uint int w") + bytes(12) + b"\xff" * 4,
+        MalformedFile,
+        "property w",
+    ),
+    "negative list": (
+        header(BINARY, "element vertex 1", *AXES, "property list int int w") + bytes(12) + b"\xff" * 4,
+        MalformedFile,
+        "length -1",
+    ),
+    "truncated faces": (
+        header(BINARY, *VERTICES, "element face 1", "property list uchar int i") + bytes(48) + b"\x03" + bytes(11),
+        MalformedFile,
+        "element face",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_malformed_file_is_refused_naming_the_place(case: str, tmp_path: Path) -> None:
+    raw, error, pattern = MALFORMED[case]
+    with pytest.raises(error, match=pattern):
+        read(tmp_path, raw)
+
+
+@pytest.mark.parametrize("encoding", [ASCII, BINARY])
+@pytest.mark.parametrize("count", [10**9, 4 * 10**9])
+def test_a_count_beyond_the_limit_is_refused_before_memory_is_taken(encoding: str, count: int, tmp_path: Path) -> None:
+    raw = header(encoding, f"element vertex {count}", *AXES) + b"0 0 0\n"
+    with pytest.raises(TooManyPoints, match=f"{count}.*100000000"):
+        read(tmp_path, raw)
+    with pytest.raises(MalformedFile, match=str(count)):
+        read(tmp_path, raw, max_points=10**10)
+
+
+def test_a_position_that_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
+    cloud = read(tmp_path, header(BINARY, *VERTICES) + bytes(48))
+    with pytest.raises(UnsupportedCloud, match=r"1e\+300"):
+        written(tmp_path, cloud.with_xyz(np.full((4, 3), 1e300)))
