@@ -26,7 +26,7 @@ def knn_torch(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
     direct = x.shape[2] < 8  # exact differences where they are cheap
     mode = "donot_use_mm_for_euclid_dist" if direct else "use_mm_for_euclid_dist"
     distance = torch.cdist(x[:, :rows], x, compute_mode=mode)
-    distance[:, torch.arange(rows), torch.arange(rows)] = torch.inf
+    distance.diagonal(dim1=1, dim2=2).fill_(torch.inf)
     found = min(k, x.shape[1] - 1)
     index = distance.topk(found, dim=2, largest=False).indices
     return index if found == k else torch.cat([index, index[:, :, -1:].expand(-1, -1, k - found)], dim=2)

@@ -14,7 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["NOISE_STD", "PATCH_SIZE", "VALIDATION_EVERY", "Batch", "PatchSource", "held_out_shapes"]
+__all__ = [
+    "CANDIDATES",
+    "NOISE_STD",
+    "PATCH_SIZE",
+    "SCALES",
+    "VALIDATION_EVERY",
+    "Batch",
+    "PatchSource",
+    "held_out_shapes",
+]
 
 PATCH_SIZE = 1000
 NOISE_STD = 0.02  # of x_0, in radii of the cloud's bounding sphere
@@ -22,7 +31,7 @@ SCALES = (0.8, 1.2)  # augmentation
 # Every tenth shape by name stays out of training, so that there is something honest to choose by.
 VALIDATION_EVERY = 10
 # Noise moves points in and out of a patch: the noisy patch is chosen among this many clean neighbours.
-_CANDIDATES = 1300
+CANDIDATES = 1300
 
 
 @dataclass(frozen=True)
@@ -57,8 +66,8 @@ class PatchSource:
     def __init__(self, clouds: list[npt.NDArray[np.float32]]) -> None:
         if not clouds:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
-        self._clouds = [_normalised(cloud) for cloud in clouds]
-        self._trees = [cKDTree(cloud) for cloud in self._clouds]
+        self.clouds = [_normalised(cloud) for cloud in clouds]
+        self._trees = [cKDTree(cloud) for cloud in self.clouds]
 
     @classmethod
     def read(cls, path: Path, *, validation: bool = False) -> PatchSource:
@@ -74,10 +83,10 @@ class PatchSource:
         return Batch(torch.from_numpy(noisy), torch.from_numpy(clean), torch.from_numpy(time).view(-1, 1, 1))
 
     def _patch(self, rng: np.random.Generator, *, augment: bool) -> tuple[npt.NDArray[np.float64], ...]:
-        which = int(rng.integers(len(self._clouds)))
-        cloud, tree = self._clouds[which], self._trees[which]
+        which = int(rng.integers(len(self.clouds)))
+        cloud, tree = self.clouds[which], self._trees[which]
         seed = cloud[rng.integers(len(cloud))]
-        _, near = tree.query(seed, k=min(_CANDIDATES, len(cloud)))
+        _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
         clean = cloud[near]  # row 0 is the seed
         noisy = clean + NOISE_STD * rng.standard_normal(clean.shape)
         distance = np.square(noisy - noisy[0]).sum(axis=1)

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
 from straightpcf.model.train.state import Average, load_state, read_network, save_state
+from straightpcf.model.train.step import GraphedStep, HostStep, Step, adam
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
@@ -78,11 +80,17 @@ def train(
 
     network = _network(stage, None if state_path.exists() else init, couplings, resuming=state_path.exists()).to(place)
     trained = _trained_part(stage, network)
-    optimiser = torch.optim.Adam(trained.parameters(), lr=learning_rate, betas=(0.9, 0.99))
+    optimiser = adam(trained, place)
     average = Average(network, _EMA_DECAY)
     start = load_state(state_path, network, average, optimiser, rng)["iteration"] if state_path.exists() else 0
 
     source = PatchSource.read(data)
+    loss_of = partial(_LOSSES[stage], network, rows=rows)
+    step: Step = (
+        GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
+        if place.type == "cuda"
+        else HostStep(source, loss_of, trained, optimiser, rng, batch_size)
+    )
     fixed = PatchSource.read(data, validation=True).draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
     validation: float | None = None
@@ -91,22 +99,18 @@ def train(
         if start == 0:
             log.writerow(["stage", "iteration", "loss", "validation", "learning_rate", "seconds"])
         recent: list[float] = []
+        recent_loss = math.nan
+        trained.train()
         for iteration in range(start + 1, iterations + 1):
             rate = _learning_rate(learning_rate, iteration, iterations)
-            for group in optimiser.param_groups:
-                group["lr"] = rate
-            batch = source.draw(rng, batch_size).to(place)
-            trained.train()
-            loss = _LOSSES[stage](network, batch, rows)
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(trained.parameters(), 1.0)
-            optimiser.step()
+            loss = step(rate)
             average.update(network, iteration)
-
-            recent.append(loss.item())
-            if not math.isfinite(recent[-1]):
-                raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
+            # On CUDA reading the loss waits for the device: only where it is reported.
+            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or iteration == iterations:
+                recent.append(loss.item())
+                if not math.isfinite(recent[-1]):
+                    raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
+                recent_loss = recent[-1]
             if iteration % _VALIDATE_EVERY == 0 or iteration == iterations:
                 validation = _validate(stage, network, average, fixed.to(place), rows)
                 progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
@@ -118,7 +122,7 @@ def train(
                 file.flush()
                 recent.clear()
             if on_step is not None:
-                on_step(TrainStep(iteration, iterations, loss.item(), validation, rate))
+                on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
             validation = None
     return state_path
 

@@ -41,11 +41,13 @@ def save_state(
     progress: dict[str, Any],
 ) -> None:  # fmt: skip
     """Write everything that `load_state` restores; the file replaces the old one whole."""
-    tensors = {f"weights.{name}": t.detach().clone().contiguous() for name, t in network.state_dict().items()}
-    tensors |= {f"average.{name}": t.contiguous() for name, t in average.tensors.items()}
+    tensors = {f"weights.{name}": t.detach().cpu().clone().contiguous() for name, t in network.state_dict().items()}
+    tensors |= {f"average.{name}": t.cpu().contiguous() for name, t in average.tensors.items()}
     for index, moments in optimiser.state_dict()["state"].items():
-        tensors |= {f"adam.{index}.{name}": torch.as_tensor(t).clone() for name, t in moments.items()}
+        tensors |= {f"adam.{index}.{name}": torch.as_tensor(t).cpu().clone() for name, t in moments.items()}
     tensors["torch_rng"] = torch.get_rng_state()
+    if torch.cuda.is_available():
+        tensors["cuda_rng"] = torch.cuda.get_rng_state()
     metadata = {"progress": json.dumps(progress), "numpy_rng": json.dumps(rng.bit_generator.state)}
     scratch = path.with_suffix(".tmp")
     save_file(tensors, scratch, metadata=metadata)
@@ -65,6 +67,8 @@ def load_state(
         moments.setdefault(int(index), {})[moment] = tensor
     optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})
     torch.set_rng_state(tensors["torch_rng"])
+    if "cuda_rng" in tensors and torch.cuda.is_available():
+        torch.cuda.set_rng_state(tensors["cuda_rng"])
     rng.bit_generator.state = json.loads(metadata["numpy_rng"])
     return dict(json.loads(metadata["progress"]))
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from straightpcf.model.train import train
+from straightpcf.model.train import Stage, train
 from straightpcf.model.train.data import PATCH_SIZE, PatchSource
+from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import InvalidOptions
 from tests.clouds import sphere, torus
@@ -38,7 +39,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 def test_training_shapes_and_validation_shapes_are_disjoint(data: Path) -> None:
     parts = [PatchSource.read(data, validation=v) for v in (False, True)]
-    clouds = [{cloud.tobytes() for cloud in part._clouds} for part in parts]
+    clouds = [{cloud.tobytes() for cloud in part.clouds} for part in parts]
     assert len(clouds[0]) + len(clouds[1]) == 11
     assert not clouds[0] & clouds[1]
     assert clouds[1]
@@ -50,6 +51,33 @@ def test_a_batch_is_noisy_clean_pairs_around_its_seeds(data: Path) -> None:
     std = (batch.noisy - batch.clean).std(dim=(1, 2))
     assert ((std > 0.015) & (std < 0.025)).all()  # 0.02, scaled by 0.8 to 1.2
     assert (batch.at(batch.time).norm(dim=2).amin(dim=1) < 1e-5).all()  # the seed is in its patch, at the origin
+
+
+def test_patches_drawn_on_the_device_are_like_those_drawn_on_the_host(data: Path) -> None:
+    torch.manual_seed(0)
+    source = PatchSource.read(data)
+    ours = DevicePatchSource(source, torch.device("cpu")).draw(16)
+    host = source.draw(np.random.default_rng(0), 16)
+    assert ours.noisy.shape == host.noisy.shape
+    assert (ours.at(ours.time).norm(dim=2).amin(dim=1) < 1e-5).all()
+    std = (ours.noisy - ours.clean).std(dim=(1, 2))
+    assert ((std > 0.015) & (std < 0.025)).all()
+    radii = [batch.clean.norm(dim=2).amax(dim=1).mean() for batch in (ours, host)]
+    assert 0.8 < radii[0] / radii[1] < 1.25
+
+
+def test_random_rotations_are_rotations() -> None:
+    turn = random_rotations(50, torch.device("cpu"))
+    torch.testing.assert_close(turn @ turn.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turn), torch.ones(50))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("stage", ["vm", "cvm"])
+def test_a_stage_runs_as_a_cuda_graph(data: Path, tmp_path: Path, velocity_run: Path, stage: Stage) -> None:
+    init = None if stage == "vm" else velocity_run
+    path = train(stage, data=data, run_dir=tmp_path, iterations=5, batch_size=4, device="cuda", init=init)
+    assert all(torch.isfinite(tensor).all() for tensor in weights(path).values())
 
 
 def test_the_same_seed_gives_the_same_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:

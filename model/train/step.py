@@ -1,0 +1,98 @@
+"""One training iteration: eager on the host, one captured graph on CUDA."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from straightpcf.model.train.data import Batch, PatchSource
+from straightpcf.model.train.device_data import DevicePatchSource
+
+__all__ = ["GraphedStep", "HostStep", "Step", "adam"]
+
+GRADIENT_NORM = 1.0
+_BETAS = (0.9, 0.99)
+_EAGER_STEPS = 3  # before the capture, so that every buffer and workspace is there
+
+Loss = Callable[[Batch], torch.Tensor]
+Step = Callable[[float], torch.Tensor]  # learning rate -> loss, a tensor that the next step may overwrite
+
+
+def adam(trained: torch.nn.Module, device: torch.device) -> torch.optim.Adam:
+    """Return the optimiser; on CUDA its learning rate and step are tensors, as a graph needs them."""
+    on_cuda = device.type == "cuda"
+    rate = torch.tensor(0.0, device=device) if on_cuda else 0.0
+    return torch.optim.Adam(trained.parameters(), lr=rate, betas=_BETAS, capturable=on_cuda)
+
+
+class HostStep:
+    """Draw on the host with `rng`, then run eagerly."""
+
+    def __init__(
+        self,
+        source: PatchSource,
+        loss: Loss,
+        trained: torch.nn.Module,
+        optimiser: torch.optim.Optimizer,
+        rng: np.random.Generator,
+        batch_size: int,
+    ) -> None:
+        self._draw: Callable[[], Batch] = lambda: source.draw(rng, batch_size)
+        self._loss, self._trained, self._optimiser = loss, trained, optimiser
+
+    def __call__(self, learning_rate: float) -> torch.Tensor:
+        """Make one update."""
+        for group in self._optimiser.param_groups:
+            group["lr"] = learning_rate
+        return _update(self._draw(), self._loss, self._trained, self._optimiser)
+
+
+class GraphedStep:
+    """Draw, evaluate and update in one CUDA graph: a replay an iteration, and no Python inside it."""
+
+    def __init__(
+        self,
+        source: PatchSource,
+        loss: Loss,
+        trained: torch.nn.Module,
+        optimiser: torch.optim.Optimizer,
+        device: torch.device,
+        batch_size: int,
+    ) -> None:
+        self._source = DevicePatchSource(source, device)
+        self._rates = [group["lr"] for group in optimiser.param_groups]
+        self._eager_left = _EAGER_STEPS
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._result = torch.zeros((), device=device)
+        self._run: Callable[[], torch.Tensor] = lambda: _update(self._source.draw(batch_size), loss, trained, optimiser)
+
+    def __call__(self, learning_rate: float) -> torch.Tensor:
+        """Make one update; the first few run eagerly on a side stream, then one is captured."""
+        for rate in self._rates:
+            rate.fill_(learning_rate)
+        if self._graph is not None:
+            self._graph.replay()
+        elif self._eager_left > 0:
+            self._eager_left -= 1
+            side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                self._result = self._run()
+            torch.cuda.current_stream().wait_stream(side)
+        else:
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._result = self._run()
+            self._graph.replay()  # capturing only records
+        return self._result
+
+
+def _update(batch: Batch, loss_of: Loss, trained: torch.nn.Module, optimiser: torch.optim.Optimizer) -> torch.Tensor:
+    optimiser.zero_grad(set_to_none=True)
+    loss = loss_of(batch)
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(trained.parameters(), GRADIENT_NORM)
+    optimiser.step()
+    return loss.detach()
