@@ -1,0 +1,169 @@
+"""NPY and NPZ: types and memory order kept, nothing unpickled, no bomb unpacked."""
+
+from __future__ import annotations
+
+import io
+import tracemalloc
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import (
+    InvalidCloud,
+    MalformedFile,
+    StraightPCFError,
+    TooManyBytes,
+    TooManyPoints,
+    UnsupportedCloud,
+)
+from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from tests.clouds import torus
+from tests.points.samples import npy, npz, plain_cloud
+
+
+def read(folder: Path, raw: bytes, **options: Any) -> PointCloud:
+    (path := folder / "body").write_bytes(raw)
+    return read_cloud(path, **options)[0]
+
+
+def written(folder: Path, cloud: PointCloud, name: str) -> bytes:
+    write_cloud(cloud, folder / "out", format_named(name))
+    return (folder / "out").read_bytes()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", "<f8", ">f2", ">f4", ">f8"])
+@pytest.mark.parametrize("shape", [(0, 3), (1, 3), (7, 3), (7, 6)])
+def test_type_shape_and_memory_order_are_kept(shape: tuple[int, int], dtype: str, order: Any, tmp_path: Path) -> None:
+    array = np.asarray(np.random.default_rng(0).random(shape).astype(dtype), order=order)
+    cloud = read(tmp_path, npy(array))
+    assert written(tmp_path, cloud, "npy") == npy(array)
+    after = np.load(io.BytesIO(written(tmp_path, cloud.with_xyz(cloud.xyz + 1), "npy")))
+    assert (after.dtype, after.flags.f_contiguous) == (array.dtype, array.flags.f_contiguous)
+    np.testing.assert_array_equal(after[:, :3], (array[:, :3].astype(float) + 1).astype(dtype))
+    np.testing.assert_array_equal(after[:, 3:], array[:, 3:])
+
+
+def test_bytes_after_the_array_are_kept(tmp_path: Path) -> None:
+    raw = npy(torus(5)) + npy(np.arange(3))
+    assert written(tmp_path, read(tmp_path, raw), "npy") == raw
+
+
+@pytest.mark.parametrize("key", ["points", "xyz", "pos", "anything"])
+def test_npz_positions_are_found_and_other_arrays_kept(key: str, tmp_path: Path) -> None:
+    others = {"label": np.arange(6), "scale": np.array(2.5), "objects": np.array([{}, None], dtype=object)}
+    if key != "anything":
+        others["normals"] = np.ones((6, 3))
+    raw = npz(**{**others, key: torus(6).astype(np.float32)})
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.attributes["label"], np.arange(6))
+    assert "objects" not in cloud.attributes
+    assert written(tmp_path, cloud, "npz") == raw
+    after = np.load(io.BytesIO(written(tmp_path, cloud.with_xyz(cloud.xyz + 1), "npz")), allow_pickle=True)
+    assert after.files == [*others, key]
+    np.testing.assert_array_equal(after[key], (torus(6).astype(np.float32) + 1.0).astype(np.float32))
+    for name, values in others.items():
+        np.testing.assert_array_equal(after[name], values)
+
+
+def test_a_new_npz_is_the_same_every_time_and_has_every_attribute(tmp_path: Path) -> None:
+    raw = written(tmp_path, plain_cloud(), "npz")
+    assert written(tmp_path, plain_cloud(), "npz") == raw
+    assert np.load(io.BytesIO(raw)).files == ["points", "intensity", "label"]
+
+
+def _npy_header(text: str) -> bytes:
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+def _declaring(shape: str, descr: str = "'<f8'", fortran: str = "False") -> bytes:
+    return _npy_header(f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}}}\n")
+
+
+def _altered(raw: bytes) -> bytes:
+    """Damage the packed bytes of the first member."""
+    at = raw.index(b"points.npy") + 60
+    return raw[:at] + bytes(byte ^ 255 for byte in raw[at : at + 20]) + raw[at + 20 :]
+
+
+BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
+    "objects": (npy(np.array([{}, None], dtype=object)), UnsupportedCloud, "never unpickled"),
+    "integers": (npy(np.zeros((5, 3), int)), UnsupportedCloud, "i8"),
+    "complex": (npy(np.zeros((5, 3), complex)), UnsupportedCloud, "c16"),
+    "long double": (npy(np.zeros((5, 3), np.longdouble)), UnsupportedCloud, "f16"),
+    "structured": (npy(np.zeros(5, [("x", "f4"), ("y", "f4")])), UnsupportedCloud, "x"),
+    "two columns": (npy(np.zeros((5, 2))), UnsupportedCloud, r"\(5, 2\)"),
+    "three dimensions": (npy(np.zeros((5, 3, 3))), UnsupportedCloud, r"\(5, 3, 3\)"),
+    "truncated": (npy(np.zeros((5, 3)))[:-1], MalformedFile, "120 bytes.* 119"),
+    "no header": (b"\x93NUMPY\x01\x00", MalformedFile, "header"),
+    "version 9": (b"\x93NUMPY\x09\x00" + bytes(100), MalformedFile, "9"),
+    "an endless header": (b"\x93NUMPY\x02\x00\xff\xff\xff\x7f" + bytes(100), MalformedFile, "2147483647"),
+    "no literal": (_npy_header("{'descr': open('x')}"), MalformedFile, "header"),
+    "deep brackets": (_npy_header("(" * 9000), MalformedFile, "header"),
+    "negative shape": (_declaring("(-5, 3)"), MalformedFile, "shape"),
+    "shape of words": (_declaring("('a', 3)"), MalformedFile, "shape"),
+    "4e9 rows": (_declaring("(4000000000, 3)"), TooManyPoints, "4000000000.*100000000"),
+    "promised rows": (_declaring("(90000000, 3)"), MalformedFile, "2160000000 bytes"),
+    "endless columns": (_declaring("(0, 100000000000)"), UnsupportedCloud, "columns"),
+    "wide columns": (_declaring("(9, 1000000000000000)") + bytes(100), UnsupportedCloud, "columns"),
+    "no zip": (b"PK\x03\x04" + bytes(200), MalformedFile, "NPZ"),
+    "truncated zip": (npz(points=torus(50))[:-30], MalformedFile, "NPZ"),
+    "damaged zip": (_altered(npz(points=torus(50))), MalformedFile, "NPZ"),
+    "no arrays": (npz(), UnsupportedCloud, "no arrays"),
+    "no positions": (npz(label=np.arange(5)), UnsupportedCloud, "label"),
+    "two candidates": (npz(a=np.zeros((5, 3)), b=np.zeros((5, 3))), UnsupportedCloud, "2 arrays.*a, b"),
+    "object positions": (npz(points=np.array([{}, None], dtype=object)), UnsupportedCloud, "never unpickled"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_file_is_refused_by_name(case: str, tmp_path: Path) -> None:
+    raw, error, pattern = BAD[case]
+    with pytest.raises(error, match=pattern):
+        read(tmp_path, raw)
+
+
+def _bomb(declared_rows: int, member_bytes: int) -> bytes:
+    with (
+        zipfile.ZipFile(buffer := io.BytesIO(), "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("points.npy", "w", force_zip64=True) as file,
+    ):
+        file.write(_declaring(f"({declared_rows}, 3)"))
+        for _ in range(member_bytes >> 20):
+            file.write(bytes(1 << 20))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("rows", [3 << 20, 5])
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(rows: int, tmp_path: Path) -> None:
+    raw = _bomb(rows, 72 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises((TooManyPoints, MalformedFile)):
+            read(tmp_path, raw, max_points=1 << 20)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_zip_that_declares_more_than_the_limit_is_refused_unread(tmp_path: Path) -> None:
+    """The declared size of a member, in the central directory, is set to 4 GiB - 1 twice."""
+    raw = bytearray(npz(points=torus(5), more=np.arange(5)))
+    at = raw.index(b"PK\x01\x02")
+    while at >= 0:
+        raw[at + 24 : at + 28] = b"\xfe\xff\xff\xff"
+        at = raw.find(b"PK\x01\x02", at + 4)
+    with pytest.raises(TooManyBytes, match=r"8589934588.* 4294967296"):
+        read(tmp_path, bytes(raw))
+
+
+def test_a_member_that_lies_about_its_size_is_malformed(tmp_path: Path) -> None:
+    raw = bytearray(npz(points=torus(50)))
+    at = raw.index(b"PK\x01\x02")
+    raw[at + 24 : at + 28] = (10**9).to_bytes(4, "little")
+    with pytest.raises(InvalidCloud):
+        read(tmp_path, bytes(raw))

@@ -1,0 +1,132 @@
+"""Text tables as people write them, and what is wrong with the others."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, TooManyPoints, UnknownFormat
+from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from tests.clouds import torus
+
+
+def read(folder: Path, raw: bytes, filename: str = "a.xyz", **options: Any) -> PointCloud:
+    (path := folder / filename).write_bytes(raw)
+    return read_cloud(path, **options)[0]
+
+
+def written(folder: Path, cloud: PointCloud, name: str = "out.xyz") -> bytes:
+    write_cloud(cloud, folder / name, format_named("xyz"))
+    return (folder / name).read_bytes()
+
+
+TABLES = {
+    "spaces": b" 1.0  2.00 3e0\n4 5 6\n",
+    "tabs, CRLF, no last end": b"1\t2\t3\r\n4\t5\t6",
+    "old Mac": b"1 2 3\r4 5 6\r",
+    "commas": b"1, 2,3\n4,5 ,6\n",
+    "semicolons": b"1;2;3;red\n4;5;6;\n",
+    "comments, blanks": b"# a, b\n\n// 1\n1 2 3\n\n#9 9 9\n 4 5 6\n// end\n\n",
+    "names": b"X Y Z\n1 2 3\n4 5 6\n",
+    "names in another order": b"id,z,y,x\n7,3,2,1\n8,6,5,4\n",
+    "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
+    "count": b"2\n1 2 3 -100 255 255 255\n4 5 6 -100 0 0 0\n",
+    "count under a comment": b"# pts\n 2 \n1 2 3\n4 5 6\n",
+    "words": b"1 2 3 tree 7\n4 5 6 house 8\n",
+    "text that is no UTF-8": b"# \xe9\n1 2 3 \xff\n4 5 6 \xfe\n",
+}
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_a_table_is_read_and_everything_but_moved_tokens_is_kept(case: str, tmp_path: Path) -> None:
+    raw = TABLES[case]
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [4, 5, 6]])
+    assert written(tmp_path, cloud) == raw
+    xyz = cloud.xyz.copy()
+    xyz[1, 1] = -0.123456789012345
+    changed = written(tmp_path, cloud.with_xyz(xyz))
+    assert changed.count(b"-0.123456789012345") == 1
+    assert changed.replace(b"-0.123456789012345", b"5") == raw
+
+
+def test_columns_of_numbers_become_attributes_under_their_names(tmp_path: Path) -> None:
+    cloud = read(tmp_path, b"x,y,z,'Scan Id',word,w\n1,2,3,7,a,nan\n4,5,6,8,b,9\n")
+    assert list(cloud.attributes) == ["Scan Id", "w"]
+    np.testing.assert_array_equal(cloud.attributes["Scan Id"], [7, 8])
+    assert list(read(tmp_path, b"1 2 3 4\n5 6 7 8\n").attributes) == ["column_4"]
+
+
+def test_nan_and_infinite_positions_are_read_and_kept(tmp_path: Path) -> None:
+    raw = b"nan NaN -nan\ninf -Inf 1e5\n1 2 3\n"
+    cloud = read(tmp_path, raw)
+    assert np.isnan(cloud.xyz[0]).all()
+    assert cloud.xyz[1].tolist() == [np.inf, -np.inf, 1e5]
+    assert written(tmp_path, cloud) == raw
+
+
+def test_a_moved_position_loses_nothing(tmp_path: Path) -> None:
+    cloud = read(tmp_path, b"500000.12 5400000.34 1\n" * 50)
+    moved = cloud.xyz + torus(50) / 3
+    np.testing.assert_array_equal(read(tmp_path, written(tmp_path, cloud.with_xyz(moved))).xyz, moved)
+
+
+def test_a_new_table_names_its_columns(tmp_path: Path) -> None:
+    cloud = PointCloud(torus(3), {"scan id": np.arange(3), "w": np.full(3, 0.1, np.float32)})
+    assert written(tmp_path, cloud).startswith(b"# x y z scan_id w\n")
+    assert b" 2 0.1\n" in written(tmp_path, cloud)
+    assert written(tmp_path, cloud, "out.csv").startswith(b"x,y,z,scan_id,w\n")
+    assert written(tmp_path, cloud, "out.pts").startswith(b"3\n# x")
+    for name in ("out.xyz", "out.csv", "out.pts"):
+        again = read_cloud(tmp_path / name)[0]
+        np.testing.assert_array_equal(again.xyz, cloud.xyz)
+        assert list(again.attributes) == ["scan_id", "w"]
+
+
+MALFORMED = {
+    "bad token": (b"1 2 3\n4 5 6\n\n7 8,9 0\n", r"line 4, column 2.*8,9"),
+    "a name among numbers": (b"x y z\n1 2 3\n1 z 3\n", r"line 3, column 2.*z"),
+    "underscores": (b"1 2 1_000\n", r"line 1, column 3.*1_000"),
+    "a very long token": (b"1 2 3\n1 2 " + b"1" * 5000 + b"\n", r"line 2, column 3"),
+    "an empty cell": (b"1,2,3\n1,,3\n", r"line 2, column 2"),
+    "more columns": (b"1 2 3\n\n1 2 3 4\n", r"line 3 has 4 columns.* 3"),
+    "fewer columns": (b"# a\n1 2 3\n1 2\n", r"line 3 has 2 columns.* 3"),
+    "two columns": (b"1 2\n3 4\n", r"line 1 has 2 columns"),
+    "prose": (b"hello world\n", r"line 1 has 2 columns"),
+    "count too high": (b"3\n1 2 3\n4 5 6\n", r"declares 3 .* holds 2"),
+    "count too low": (b"1\n1 2 3\n4 5 6\n", r"declares 1 .* holds 2"),
+    "binary": (b"1 2 3\n\x00\x01\x02", r"0x00"),
+    "UTF-16": ("1 2 3\n".encode("utf-16"), r"0x00"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_malformed_table_is_refused_naming_the_place(case: str, tmp_path: Path) -> None:
+    raw, pattern = MALFORMED[case]
+    with pytest.raises(MalformedFile, match=pattern):
+        read(tmp_path, raw)
+
+
+def test_a_count_line_beyond_the_limit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TooManyPoints, match=r"line 1 .*4000000000"):
+        read(tmp_path, b"4000000000\n1 2 3\n", "a.pts")
+
+
+def test_text_is_never_guessed_from_its_content(tmp_path: Path) -> None:
+    with pytest.raises(UnknownFormat):
+        read(tmp_path, b"1 2 3\n4 5 6\n", "body")
+    assert len(read(tmp_path, b"1 2 3\n4 5 6\n", "body", name="Scan.TXT")) == 2
+
+
+def test_errors_far_down_a_long_file_are_found(tmp_path: Path) -> None:
+    """Past the first block of the reader, so that line numbers add up across blocks."""
+    raw = b"1.0 2.0 3.0\n" * 800_000
+    began = time.monotonic()
+    with pytest.raises(MalformedFile, match=r"line 800001, column 3.*oops"):
+        read(tmp_path, raw + b"1 2 oops\n")
+    assert time.monotonic() - began < 20
