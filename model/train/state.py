@@ -41,8 +41,10 @@ def save_state(
     progress: dict[str, Any],
 ) -> None:  # fmt: skip
     """Write everything that `load_state` restores; the file replaces the old one whole."""
-    tensors = {f"weights.{name}": t.detach().cpu().clone().contiguous() for name, t in network.state_dict().items()}
-    tensors |= {f"average.{name}": t.cpu().contiguous() for name, t in average.tensors.items()}
+    tensors = {f"average.{name}": t.cpu().contiguous() for name, t in average.tensors.items()}
+    for name, tensor in network.state_dict().items():
+        if not torch.equal(tensor, average.tensors[name]):  # what is frozen is its own average
+            tensors[f"weights.{name}"] = tensor.detach().cpu().clone().contiguous()
     for index, moments in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(t).cpu().clone() for name, t in moments.items()}
     tensors["torch_rng"] = torch.get_rng_state()
@@ -59,7 +61,7 @@ def load_state(
 ) -> dict[str, Any]:
     """Restore a run in place and return its progress as saved."""
     tensors, metadata = _read(path)
-    network.load_state_dict(_under(tensors, "weights."))
+    network.load_state_dict(_under(tensors, "average.") | _under(tensors, "weights."))
     average.tensors = {name: t.to(average.tensors[name].device) for name, t in _under(tensors, "average.").items()}
     moments: dict[int, dict[str, torch.Tensor]] = {}
     for name, tensor in _under(tensors, "adam.").items():
