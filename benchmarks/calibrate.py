@@ -18,7 +18,8 @@ import numpy.typing as npt
 from benchmarks.quality import SHARED
 from straightpcf.model.checkpoint import save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
-from straightpcf.model.train.calibrate import calibrate, passes
+from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.calibrate import NOISE_LEVELS, calibrate, passes
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network
 
@@ -28,14 +29,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
-    parser.add_argument("--resolution", type=int, nargs="+", default=[10000, 50000])
+    parser.add_argument("--clouds", nargs="+", help="<shape>/<resolution>; by default all held-out shapes at 10000")
+    parser.add_argument("--noise", type=float, nargs="+", default=NOISE_LEVELS)
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
     arguments = parser.parse_args()
 
     network, progress = read_network(arguments.state)
-    clouds = _clouds(arguments.data, arguments.resolution)
-    calibration, traces = calibrate(network, clouds, threads=arguments.threads)
+    clouds = _clouds(arguments.data, arguments.clouds)
+    calibration, traces = calibrate(network, clouds, noise_stds=arguments.noise, threads=arguments.threads)
     print(f"{'cloud':18} {'noise':>7}  {'d before each pass':32} {'CD x1e4 after 0, 1, ... passes':42} auto best")
     for t in traces:
         chosen, best = passes(calibration, t.distances), int(np.argmin(t.chamfer))
@@ -54,15 +56,15 @@ def main() -> None:
         print(f"written {arguments.out}")
 
 
-def _clouds(path: Path, resolutions: list[int]) -> dict[str, npt.NDArray[np.float64]]:
+def _clouds(path: Path, wanted: list[str] | None) -> dict[str, npt.NDArray[np.float64]]:
     clouds = {}
     with np.load(path, allow_pickle=False) as archive:
-        for name in archive.files:
-            shape, resolution = name.split("/")
-            if shape in held_out_shapes(archive.files) and int(resolution) in resolutions:
-                xyz = archive[name].astype(np.float64)
-                xyz -= (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-                clouds[name] = xyz / float(np.linalg.norm(xyz, axis=1).max())
+        held_out = held_out_shapes(archive.files)
+        for name in wanted or [f"{shape}/10000" for shape in sorted(held_out)]:
+            if name.split("/")[0] not in held_out:
+                raise SystemExit(f"{name} was trained on; held out are {', '.join(sorted(held_out))}")
+            xyz = archive[name].astype(np.float64)
+            clouds[name] = CloudFrame.of(xyz).enter(xyz)
     return clouds
 
 

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from straightpcf.model.normalize import CloudFrame
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = [
@@ -66,7 +67,8 @@ class PatchSource:
     def __init__(self, clouds: list[npt.NDArray[np.float32]]) -> None:
         if not clouds:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
-        self.clouds = [_normalised(cloud) for cloud in clouds]
+        wide = [cloud.astype(np.float64) for cloud in clouds]
+        self.clouds = [CloudFrame.of(cloud).enter(cloud) for cloud in wide]
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
 
     @classmethod
@@ -98,9 +100,3 @@ class PatchSource:
             transform = Rotation.random(random_state=rng).as_matrix() * rng.uniform(*SCALES)
         inside = rng.permutation(inside)
         return (noisy[inside] - origin) @ transform, (clean[inside] - origin) @ transform, np.array(time)
-
-
-def _normalised(cloud: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    xyz = cloud.astype(np.float64)
-    xyz -= (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    return xyz / float(np.linalg.norm(xyz, axis=1).max())

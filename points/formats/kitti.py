@@ -1,0 +1,66 @@
+"""KITTI Velodyne frames: bare float32 rows of x, y, z, intensity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile
+from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.positions import narrowed, put_positions
+
+__all__ = ["Kitti"]
+
+ROW_BYTES = 16
+
+
+@dataclass(frozen=True)
+class KittiSource:
+    """Hold the frame's bytes and the positions that were read from them."""
+
+    raw: bytes
+    xyz: npt.NDArray[np.float64]
+
+
+class Kitti(Format):
+    """Read and write .bin frames; nothing in the bytes says what they are, so the name decides."""
+
+    name = "kitti"
+    suffixes = (".bin",)
+    media_type = "application/octet-stream"
+    has_magic = False
+
+    def sniff(self, head: bytes) -> bool:
+        """Recognise nothing: any 16 bytes are a row."""
+        return False
+
+    def read(self, path: Path, *, max_points: int) -> PointCloud:
+        """Read rows of four float32; the fourth is the attribute `intensity`."""
+        size = path.stat().st_size
+        check_count(size // ROW_BYTES, max_points, where=f"a KITTI frame of {size} bytes")
+        if size % ROW_BYTES:
+            raise MalformedFile(f"a KITTI frame has {ROW_BYTES} bytes a point; {size} bytes end within one")
+        raw = path.read_bytes()
+        rows = np.frombuffer(raw, "<f4").reshape(-1, 4)
+        xyz = rows[:, :3].astype(np.float64)
+        return PointCloud(xyz, {"intensity": rows[:, 3]}, KittiSource(raw, xyz.copy()))
+
+    def write(self, cloud: PointCloud, path: Path) -> None:
+        """Write the rows with their positions replaced; a cloud of another format as float32, intensity or 0."""
+        source = cloud.source
+        if isinstance(source, KittiSource):
+            out = bytearray(source.raw)
+            rows = np.frombuffer(out, "<f4").reshape(-1, 4)
+            put_positions([rows[:, axis] for axis in range(3)], cloud.xyz, source.xyz)
+            path.write_bytes(out)
+            return
+        table = np.zeros((len(cloud), 4), "<f4")
+        table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
+        intensity = cloud.attributes.get("intensity")
+        if intensity is not None and intensity.ndim == 1 and intensity.dtype.kind in "biuf":
+            table[:, 3] = narrowed(intensity.astype(np.float64), table.dtype, what="an intensity")
+        path.write_bytes(table.tobytes())

@@ -1,0 +1,149 @@
+"""LASzip compression of LAS points through lazrs; what a broken file could make it do is checked first."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from typing import Any
+
+from straightpcf.points.errors import MalformedFile, MissingDependency, UnsupportedCloud
+from straightpcf.points.formats.base import check_room
+from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader
+
+__all__ = ["pack", "packing_record", "unpack"]
+
+VARIABLE_CHUNKS = 0xFFFFFFFF
+_POINTWISE, _LAYERED = 2, 3
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # item type -> layers of one chunk; type 14, extra bytes, has one a byte
+
+
+def _lazrs() -> Any:
+    try:
+        import lazrs
+    except ImportError as exc:
+        raise MissingDependency("LAZ needs the extra straightpcf[las]: pip install 'straightpcf[las]'") from exc
+    return lazrs
+
+
+@contextmanager
+def _converted() -> Iterator[None]:
+    """Turn what lazrs raises into MalformedFile, here and only here."""
+    try:
+        yield
+    except (RuntimeError, OSError, ValueError, OverflowError, EOFError) as exc:
+        raise MalformedFile(f"the LAZ points cannot be unpacked: {exc}") from exc
+    except BaseException as exc:
+        if type(exc).__name__ != "PanicException":  # how a Rust panic arrives: no Exception, not importable
+            raise
+        raise MalformedFile(f"the LAZ points cannot be unpacked: {exc}") from exc
+
+
+def unpack(raw: bytes, header: LasHeader) -> bytearray:
+    """Return the points' bytes, points x row_bytes."""
+    lazrs = _lazrs()
+    if not header.points:
+        return bytearray()
+    record = header.record(*LASZIP_ID)
+    if record is None:
+        raise MalformedFile("a LAZ file without a laszip record: nothing says how its points are packed")
+    chunk_size = _check_record(record.data, header)
+    _check_chunk_table(raw, header, chunk_size)
+    with _converted():
+        lazrs.LazVlr(record.data)
+        source = BytesIO(raw)
+        source.seek(header.data_begin)
+        chunks = lazrs.read_chunk_table(source, lazrs.LazVlr(record.data))
+    _check_chunks(raw, header, record.data, [(int(points), int(size)) for points, size in chunks], chunk_size)
+    out = bytearray(header.points * header.row_bytes)
+    with _converted():
+        source.seek(header.data_begin)
+        lazrs.LasZipDecompressor(source, record.data).decompress_many(out)
+    return out
+
+
+def packing_record(header: LasHeader) -> bytes:
+    """Return the laszip record's data to pack with: the file's own where it can be written again, else a new one."""
+    lazrs = _lazrs()
+    record = header.record(*LASZIP_ID)
+    if record is not None and header.points:
+        chunk_size = _check_record(record.data, header)
+        versions = [version for _, _, version in _items(record.data)]
+        if chunk_size != VARIABLE_CHUNKS and min(versions) >= 2:
+            return record.data
+    standard = {0: 20, 1: 28, 2: 26, 3: 34, 6: 30, 7: 36, 8: 38}
+    if header.point_format not in standard:
+        raise UnsupportedCloud(f"LAS point format {header.point_format} cannot be packed as LAZ; write LAS")
+    extra = header.row_bytes - standard[header.point_format]
+    return bytes(lazrs.LazVlr.new_for_compression(header.point_format, extra).record_data())
+
+
+def pack(points: bytes, record: bytes, begin: int) -> bytes:
+    """Pack points; the chunk table's place counts from the file's start, and the points begin at byte `begin`."""
+    lazrs = _lazrs()
+    sink = BytesIO(bytes(begin))
+    sink.seek(begin)
+    with _converted():
+        packer = lazrs.LasZipCompressor(sink, lazrs.LazVlr(record))
+        packer.compress_many(points)
+        packer.done()
+    return sink.getvalue()[begin:]
+
+
+def _items(record: bytes) -> list[tuple[int, int, int]]:
+    """Return the items as (type, bytes, version)."""
+    count = struct.unpack_from("<H", record, 32)[0]
+    return [struct.unpack_from("<HHH", record, 34 + 6 * item) for item in range(count)]
+
+
+def _check_record(record: bytes, header: LasHeader) -> int:
+    """Check the laszip record against the header; return the points of a chunk."""
+    check_room(34, len(record), what="the laszip record")
+    packer, coder = struct.unpack_from("<HH", record, 0)
+    chunk_size, count = struct.unpack_from("<I", record, 12)[0], struct.unpack_from("<H", record, 32)[0]
+    check_room(34 + 6 * count, len(record), what=f"the laszip record of {count} items")
+    if packer not in (_POINTWISE, _LAYERED) or coder != 0:
+        raise UnsupportedCloud(f"LASzip compressor {packer}, coder {coder} is not known; 2 and 3 with coder 0 are")
+    size = sum(size for _, size, _ in _items(record))
+    if size != header.row_bytes:
+        raise MalformedFile(f"the laszip record packs {size} bytes a point, the LAS header declares {header.row_bytes}")
+    if chunk_size == 0:
+        raise MalformedFile("the laszip record declares chunks of 0 points")
+    return int(chunk_size)
+
+
+def _check_chunk_table(raw: bytes, header: LasHeader, chunk_size: int) -> None:
+    """Check where the chunk table is and how many chunks it declares: lazrs takes memory for that many."""
+    begin = header.data_begin
+    check_room(8, len(raw) - begin, what="the offset of the LAZ chunk table")
+    (table,) = struct.unpack_from("<q", raw, begin)
+    if table == -1:  # written to a pipe: the offset is at the end
+        (table,) = struct.unpack_from("<q", raw, len(raw) - 8)
+    if not begin + 8 <= table <= len(raw) - 8:
+        raise MalformedFile(f"the LAZ chunk table is said to be at byte {table}, outside {begin + 8}..{len(raw) - 8}")
+    _, chunks = struct.unpack_from("<II", raw, table)
+    check_room(chunks * header.row_bytes, table - begin, what=f"LAZ data of {chunks} chunks")
+    if chunk_size != VARIABLE_CHUNKS and header.points > chunks * chunk_size:
+        raise MalformedFile(
+            f"the LAS header declares {header.points} points, but {chunks} LAZ chunks of {chunk_size} hold fewer"
+        )
+
+
+def _check_chunks(raw: bytes, header: LasHeader, record: bytes, chunks: list[tuple[int, int]], chunk_size: int) -> None:
+    """Check every chunk's place, and the sizes of its layers: lazrs takes memory for what they declare."""
+    if chunk_size == VARIABLE_CHUNKS and sum(points for points, _ in chunks) != header.points:
+        raise MalformedFile(
+            f"the LAS header declares {header.points} points, the LAZ chunks {sum(points for points, _ in chunks)}"
+        )
+    is_layered = struct.unpack_from("<H", record, 0)[0] == _LAYERED
+    layers = sum(_LAYERS.get(kind, size) for kind, size, _ in _items(record))
+    at = header.data_begin + 8
+    for number, (_, size) in enumerate(chunks):
+        check_room(size, len(raw) - at, what=f"LAZ chunk {number} at byte {at}")
+        if is_layered:
+            head = header.row_bytes + 4 + 4 * layers
+            check_room(head, size, what=f"the head of LAZ chunk {number} at byte {at}")
+            sizes = struct.unpack_from(f"<{layers}I", raw, at + header.row_bytes + 4)
+            check_room(head + sum(sizes), size, what=f"LAZ chunk {number} at byte {at} of {layers} layers")
+        at += size

@@ -1,0 +1,206 @@
+"""PCD: ascii, binary and binary_compressed; everything but moved positions is kept as it stands."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile
+from straightpcf.points.formats import lzf
+from straightpcf.points.formats.base import Format, check_count, check_room
+from straightpcf.points.formats.pcd_header import PcdHeader, read_header
+from straightpcf.points.formats.positions import AXES, moved, put_positions
+from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
+
+__all__ = ["Pcd"]
+
+_TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
+
+
+@dataclass(frozen=True)
+class PcdSource:
+    """Hold the file, its parsed header and the positions that were read from it.
+
+    starts, ends: (N, 3) int64 byte offsets of the tokens of a text file.  unpacked: of a compressed one.
+    """
+
+    raw: bytes
+    header: PcdHeader
+    xyz: npt.NDArray[np.float64]
+    starts: npt.NDArray[np.int64] | None = None
+    ends: npt.NDArray[np.int64] | None = None
+    unpacked: bytes | None = None
+
+
+class Pcd(Format):
+    """Read and write PCD; x, y and z must be fields of one float."""
+
+    name = "pcd"
+    suffixes = (".pcd",)
+    media_type = "application/vnd.pcl.pcd"
+
+    def sniff(self, head: bytes) -> bool:
+        """Recognise the comment that PCL writes, or the first keyword after comments."""
+        if head.startswith(b"# .PCD"):
+            return True
+        lines = (line.strip() for line in head.split(b"\n"))
+        first = next((line for line in lines if line and not line.startswith(b"#")), b"")
+        return first.startswith((b"VERSION ", b"FIELDS "))
+
+    def read(self, path: Path, *, max_points: int) -> PointCloud:
+        """Read all fields; those with COUNT > 1 become (N, COUNT) attributes."""
+        raw = path.read_bytes()
+        header = read_header(raw)
+        check_count(header.points, max_points, where="PCD POINTS")
+        if header.encoding == "ascii":
+            return _read_ascii(raw, header)
+        unpacked = _unpacked(raw, header) if header.encoding == "binary_compressed" else None
+        columns = _columns(raw, header) if unpacked is None else _planes(unpacked, header)
+        xyz = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
+        return PointCloud(xyz, _attributes(columns), PcdSource(raw, header, xyz.copy(), unpacked=unpacked))
+
+    def write(self, cloud: PointCloud, path: Path) -> None:
+        """Write the file that was read with its positions replaced, or a new binary one."""
+        source = cloud.source
+        if not isinstance(source, PcdSource):
+            path.write_bytes(_new_file(cloud))
+        elif not moved(cloud.xyz, source.xyz).any():
+            path.write_bytes(source.raw)
+        elif source.starts is not None and source.ends is not None:
+            path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
+        elif source.unpacked is not None:
+            path.write_bytes(_repacked(source, source.unpacked, cloud.xyz))
+        else:
+            out = bytearray(source.raw)
+            columns = _columns(out, source.header)
+            put_positions([columns[axis] for axis in AXES], cloud.xyz, source.xyz)
+            path.write_bytes(out)
+
+
+def _attributes(columns: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    return {name: values for name, values in columns.items() if name not in AXES and name.strip("_")}
+
+
+def _columns(raw: bytes | bytearray, header: PcdHeader) -> dict[str, npt.NDArray[Any]]:
+    """View the rows of a binary file."""
+    dtype = header.row_dtype
+    check_room(header.points * dtype.itemsize, len(raw) - header.size, what=f"PCD data of {header.points} points")
+    rows = np.frombuffer(raw, dtype, header.points, header.size) if header.points else np.empty(0, dtype)
+    return {field.label: rows[field.label] for field in header.fields}
+
+
+def _unpacked(raw: bytes, header: PcdHeader) -> bytes:
+    expected = header.points * header.row_dtype.itemsize
+    if expected == 0 and len(raw) < header.size + 8:
+        return b""
+    check_room(8, len(raw) - header.size, what="the two sizes before compressed PCD data")
+    packed_size, size = struct.unpack_from("<II", raw, header.size)
+    if size != expected:
+        raise MalformedFile(f"compressed PCD data declares {size} bytes unpacked, the header's fields need {expected}")
+    check_room(packed_size, len(raw) - header.size - 8, what=f"compressed PCD data at byte {header.size + 8}")
+    return lzf.decompress(raw[header.size + 8 : header.size + 8 + packed_size], size)
+
+
+def _planes(unpacked: bytes | bytearray, header: PcdHeader) -> dict[str, npt.NDArray[Any]]:
+    """View the fields of an unpacked file: one after the other, each for all points."""
+    columns: dict[str, npt.NDArray[Any]] = {}
+    at = 0
+    for field in header.fields:
+        values = header.points * field.count
+        plane = np.frombuffer(unpacked, field.dtype, values, at) if values else np.empty(0, field.dtype)
+        columns[field.label] = plane.reshape(header.points, field.count) if field.count != 1 else plane
+        at += values * field.dtype.itemsize
+    return columns
+
+
+def _repacked(source: PcdSource, unpacked: bytes, xyz: npt.NDArray[np.float64]) -> bytes:
+    out = bytearray(unpacked)
+    columns = _planes(out, source.header)
+    put_positions([columns[axis] for axis in AXES], xyz, source.xyz)
+    packed = lzf.compress(bytes(out))
+    begin = source.header.size
+    (packed_size,) = struct.unpack_from("<I", source.raw, begin)
+    sizes = struct.pack("<II", len(packed), len(out))
+    return b"".join([source.raw[:begin], sizes, packed, source.raw[begin + 8 + packed_size :]])
+
+
+def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
+    refuse_binary(raw, header.size)
+    width = sum(field.count for field in header.fields)
+    check_room(
+        max(2 * width * header.points - 1, 0),
+        len(raw) - header.size,
+        what=f"PCD data of {header.points} points with {width} values",
+    )
+    parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
+    starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+    left = header.points
+    for lines, _ in blocks(raw, header.size) if left else ():
+        rows = lines.head(left)
+        line = header.lines + 1 + header.points - left
+        wrong = rows.counts != width
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise MalformedFile(f"line {line + row} has {rows.counts[row]} values, the PCD fields have {width}")
+        columns, at = {}, 0
+        for field in header.fields:
+            index = (rows.first[:, None] + np.arange(at, at + field.count)).reshape(-1)
+            columns[field.label] = rows.starts[index], rows.ends[index]
+            read = as_numbers if field.dtype.kind == "f" else None
+            first, last = columns[field.label]
+            values, bad = read(raw, first, last) if read else as_integers(raw, first, last, field.dtype)
+            if bad is not None:
+                token = shown(raw[first[bad] : last[bad]])
+                raise MalformedFile(
+                    f"line {line + bad // field.count}: {field.label} is {token}, no {field.dtype.name}"
+                )
+            parts[field.label].append(values if field.count == 1 else values.reshape(-1, field.count))
+            at += field.count
+        starts.append(np.stack([columns[axis][0] for axis in AXES], axis=1))
+        ends.append(np.stack([columns[axis][1] for axis in AXES], axis=1))
+        left -= len(rows)
+        if left == 0:
+            break
+    if left:
+        raise MalformedFile(
+            f"PCD POINTS is {header.points}, the file ends after {header.points - left}: it is truncated"
+        )
+    found = {
+        field.label: np.concatenate(parts[field.label]) if parts[field.label] else np.empty(0, field.dtype)
+        for field in header.fields
+    }
+    xyz = np.stack([found[axis].astype(np.float64) for axis in AXES], axis=1)
+    source = PcdSource(raw, header, xyz.copy(), np.concatenate(starts), np.concatenate(ends))
+    return PointCloud(xyz, _attributes(found), source)
+
+
+def _new_file(cloud: PointCloud) -> bytes:
+    """Write a binary file with double positions and every attribute as fields of one value."""
+    columns = {axis: cloud.xyz[:, column].astype("<f8") for column, axis in enumerate(AXES)}
+    columns |= scalar_columns(cloud.attributes, _TYPES, taken=AXES)
+    table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    kinds = [values.dtype for values in columns.values()]
+    header = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {len(cloud)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(cloud)}",
+        "DATA binary",
+        "",
+    ]
+    return "\n".join(header).encode() + table.tobytes()

@@ -1,0 +1,130 @@
+"""The header of a PCD file: fields, counts, and how the data is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.formats.text import shown
+
+__all__ = ["PcdField", "PcdHeader", "read_header"]
+
+MAX_HEADER_BYTES = 1 << 20
+MAX_COUNT = 1 << 20
+_KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+_ENCODINGS = ("ascii", "binary", "binary_compressed")
+_KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
+
+
+@dataclass(frozen=True)
+class PcdField:
+    """Describe one field of `count` values a point; label: its name, numbered where names repeat (padding `_`)."""
+
+    label: str
+    dtype: np.dtype[Any]
+    count: int
+
+
+@dataclass(frozen=True)
+class PcdHeader:
+    """Describe the file; size: bytes up to the data.  lines: of the header."""
+
+    fields: tuple[PcdField, ...]
+    points: int
+    encoding: str
+    size: int
+    lines: int
+
+    @property
+    def row_dtype(self) -> np.dtype[Any]:
+        """Return the type of one point of a binary file."""
+        return np.dtype([(f.label, f.dtype, (f.count,) if f.count != 1 else ()) for f in self.fields])
+
+
+def read_header(raw: bytes) -> PcdHeader:
+    """Parse the header of a PCD file; raises MalformedFile naming the line."""
+    entries: dict[str, list[str]] = {}
+    begin, number = 0, 0
+    while "DATA" not in entries:
+        end = raw.find(b"\n", begin, MAX_HEADER_BYTES)
+        if end < 0:
+            reason = f"has more than {MAX_HEADER_BYTES} bytes, the limit" if len(raw) > MAX_HEADER_BYTES else "ends"
+            raise MalformedFile(f"the PCD header {reason} in line {number + 1}, before DATA")
+        number += 1
+        line, begin = raw[begin:end].strip(), end + 1
+        if not line or line.startswith(b"#"):
+            continue
+        try:
+            keyword, *words = line.decode("ascii").split()
+        except UnicodeDecodeError as exc:
+            raise MalformedFile(f"line {number} of the PCD header is not ASCII: {shown(line)}") from exc
+        if keyword not in _KEYWORDS or keyword in entries:
+            raise MalformedFile(f"line {number} of the PCD header is unknown or there twice: {shown(line)}")
+        entries[keyword] = words
+    fields = _fields(entries)
+    encoding = " ".join(entries["DATA"])
+    if encoding not in _ENCODINGS:
+        raise MalformedFile(f"PCD DATA is {encoding[:40]!r}; it must be one of {', '.join(_ENCODINGS)}")
+    return PcdHeader(fields, _points(entries), encoding, begin, number)
+
+
+def _fields(entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
+    for keyword in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT"):
+        if keyword not in entries:
+            raise MalformedFile(f"the PCD header has no {keyword}")
+    names = entries["FIELDS"]
+    counts = entries.get("COUNT", ["1"] * len(names))
+    if not len(names) == len(entries["SIZE"]) == len(entries["TYPE"]) == len(counts):
+        raise MalformedFile(
+            f"the PCD header has {len(names)} FIELDS, but SIZE, TYPE and COUNT of "
+            f"{len(entries['SIZE'])}, {len(entries['TYPE'])} and {len(counts)}"
+        )
+    fields: list[PcdField] = []
+    used: set[str] = set()
+    for name, size, kind, count in zip(names, entries["SIZE"], entries["TYPE"], counts, strict=True):
+        label = name
+        while label in used:
+            label += "_"
+        used.add(label)
+        fields.append(_field(label, size, kind, count))
+    by_label = {field.label: field for field in fields}
+    for axis in ("x", "y", "z"):
+        if axis not in by_label:
+            raise MalformedFile(f"PCD FIELDS are {' '.join(names)[:200]}; there is no {axis}")
+        if axis + "_" in by_label and names.count(axis) > 1:
+            raise MalformedFile(f"PCD FIELDS name {axis} twice")
+        if by_label[axis].dtype.kind != "f" or by_label[axis].count != 1:
+            raise UnsupportedCloud(
+                f"PCD field {axis} is {by_label[axis].count} x {by_label[axis].dtype.name}; "
+                "moved points need one float of 4 or 8 bytes"
+            )
+    return tuple(fields)
+
+
+def _field(label: str, size: str, kind: str, count: str) -> PcdField:
+    letter, sizes = _KINDS.get(kind, ("", ()))
+    if size not in [str(known) for known in sizes]:
+        raise MalformedFile(
+            f"PCD field {label[:40]} has TYPE {kind[:40]!r} of SIZE {size[:40]!r}, which does not exist"
+        )
+    values = _whole(count, f"COUNT of PCD field {label[:40]}")
+    if not 1 <= values <= MAX_COUNT:
+        raise MalformedFile(f"COUNT of PCD field {label[:40]} is {values}; it must be in 1..{MAX_COUNT}")
+    return PcdField(label, np.dtype("<" + letter + size), values)
+
+
+def _points(entries: dict[str, list[str]]) -> int:
+    width, height = (_whole(" ".join(entries[key]), f"PCD {key}") for key in ("WIDTH", "HEIGHT"))
+    points = _whole(" ".join(entries["POINTS"]), "PCD POINTS") if "POINTS" in entries else width * height
+    if points != width * height:
+        raise MalformedFile(f"PCD POINTS is {points}, but WIDTH {width} x HEIGHT {height} is {width * height}")
+    return points
+
+
+def _whole(text: str, what: str) -> int:
+    if not (text.isdigit() and len(text) <= 18):
+        raise MalformedFile(f"{what} is {text[:40]!r}, which is no whole number >= 0")
+    return int(text)
