@@ -150,7 +150,7 @@ class InternalError(StraightPCFError):
     code = "internal_error"
 
 
-class ConnectionFailed(InternalError):
+class ConnectionFailed(InternalError):  # noqa: N818
     """Report a server that did not answer, or broke off."""
 
     code = "connection_failed"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,7 @@ class Las(Format):
     """Read and write LAS 1.0 to 1.5, point formats 0 to 10, without a library in between."""
 
     name = "las"
-    suffixes: tuple[str, ...] = (".las",)
+    suffixes: ClassVar[tuple[str, ...]] = (".las",)
     media_type = "application/vnd.las"
     is_compressed = False
 
@@ -79,7 +80,7 @@ class Laz(Las):
     """Read and write LAZ with lazrs, from the extra straightpcf[las]."""
 
     name = "laz"
-    suffixes = (".laz",)
+    suffixes: ClassVar[tuple[str, ...]] = (".laz",)
     media_type = "application/vnd.laszip"
     is_compressed = True
 
