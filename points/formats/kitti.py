@@ -11,7 +11,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats.base import Format, check_count
-from straightpcf.points.formats.positions import narrowed, put_positions
+from straightpcf.points.formats.positions import narrowed, put_positions, widened
 
 __all__ = ["Kitti"]
 
@@ -46,7 +46,7 @@ class Kitti(Format):
             raise MalformedFile(f"a KITTI frame has {ROW_BYTES} bytes a point; {size} bytes end within one")
         raw = path.read_bytes()
         rows = np.frombuffer(raw, "<f4").reshape(-1, 4)
-        xyz = rows[:, :3].astype(np.float64)
+        xyz = widened([rows[:, axis] for axis in range(3)])
         return PointCloud(xyz, {"intensity": rows[:, 3]}, KittiSource(raw, xyz.copy()))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
@@ -62,5 +62,7 @@ class Kitti(Format):
         table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
         intensity = cloud.attributes.get("intensity")
         if intensity is not None and intensity.ndim == 1 and intensity.dtype.kind in "biuf":
-            table[:, 3] = narrowed(intensity.astype(np.float64), table.dtype, what="an intensity")
+            with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
+                wide = intensity.astype(np.float64)
+            table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
         path.write_bytes(table.tobytes())

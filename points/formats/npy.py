@@ -19,6 +19,7 @@ from straightpcf.points.formats.npy_array import (
     positions_header,
     view,
 )
+from straightpcf.points.formats.positions import widened
 from straightpcf.points.formats.scalars import further_columns
 
 __all__ = ["Npy"]
@@ -53,7 +54,7 @@ class Npy(Format):
             file.seek(0)
             raw = file.read()
         rows = view(raw, header)
-        xyz = rows[:, :3].astype(np.float64, order="C")
+        xyz = widened([rows[:, axis] for axis in range(3)])
         return PointCloud(xyz, further_columns(rows), NpySource(raw, header, xyz.copy()))
 
     def write(self, cloud: PointCloud, path: Path) -> None:

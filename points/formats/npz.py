@@ -25,7 +25,7 @@ from straightpcf.points.formats.npy_array import (
     read_header,
     view,
 )
-from straightpcf.points.formats.positions import moved
+from straightpcf.points.formats.positions import moved, widened
 from straightpcf.points.formats.scalars import further_columns
 
 __all__ = ["KEYS", "MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
@@ -68,7 +68,7 @@ class Npz(Format):
             header = positions_header(_head(archive, member), where=where, max_points=max_points)
             array = _unpacked(archive, member, header)
             rows = view(array, header)
-            xyz = rows[:, :3].astype(np.float64, order="C")
+            xyz = widened([rows[:, axis] for axis in range(3)])
             attributes = further_columns(rows)
             for other in members:
                 head = b"" if other is member else _head(archive, other)

@@ -15,7 +15,7 @@ from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.pcd_header import PcdHeader, read_header
-from straightpcf.points.formats.positions import AXES, moved, put_positions
+from straightpcf.points.formats.positions import AXES, moved, put_positions, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
@@ -63,7 +63,7 @@ class Pcd(Format):
             return _read_ascii(raw, header)
         unpacked = _unpacked(raw, header) if header.encoding == "binary_compressed" else None
         columns = _columns(raw, header) if unpacked is None else _planes(unpacked, header)
-        xyz = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
+        xyz = widened([columns[axis] for axis in AXES])
         return PointCloud(xyz, _attributes(columns), PcdSource(raw, header, xyz.copy(), unpacked=unpacked))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
@@ -176,7 +176,7 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         field.label: np.concatenate(parts[field.label]) if parts[field.label] else np.empty(0, field.dtype)
         for field in header.fields
     }
-    xyz = np.stack([found[axis].astype(np.float64) for axis in AXES], axis=1)
+    xyz = widened([found[axis] for axis in AXES])
     source = PcdSource(raw, header, xyz.copy(), np.concatenate(starts), np.concatenate(ends))
     return PointCloud(xyz, _attributes(found), source)
 

@@ -14,7 +14,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.ply_header import PlyElement, PlyHeader, read_header
 from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows
-from straightpcf.points.formats.positions import AXES, gathered, moved, narrowed, put_positions, scattered
+from straightpcf.points.formats.positions import AXES, gathered, moved, narrowed, put_positions, scattered, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import refuse_binary, replaced
 
@@ -54,7 +54,7 @@ class Ply(Format):
         check_count(vertex.count, max_points, where="element vertex")
         begin, rows = _find(raw, header, vertex)
         values = rows.values if isinstance(rows, AsciiRows) else _values(raw, vertex, rows)
-        xyz = np.stack([values[axis].astype(np.float64) for axis in AXES], axis=1)
+        xyz = widened([values[axis] for axis in AXES])
         attributes = {name: value for name, value in values.items() if name not in AXES}
         return PointCloud(xyz, attributes, PlySource(raw, begin, rows, vertex, xyz.copy()))
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import UnsupportedCloud
 
-__all__ = ["AXES", "gathered", "moved", "narrowed", "number_text", "put_positions", "scattered"]
+__all__ = ["AXES", "gathered", "moved", "narrowed", "number_text", "put_positions", "scattered", "widened"]
 
 AXES = "xyz"
 
@@ -20,6 +20,12 @@ def moved(new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]) -> npt.NDA
     changed: npt.NDArray[np.bool_] = new != old
     changed &= ~(np.isnan(new) & np.isnan(old))
     return changed
+
+
+def widened(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
+    """Stack a file's x, y and z, three (N,) float columns, to (N, 3) float64; a signalling NaN is no warning."""
+    with np.errstate(invalid="ignore"):
+        return np.stack([column.astype(np.float64) for column in columns], axis=1)
 
 
 def narrowed(values: npt.NDArray[np.float64], dtype: np.dtype[Any], *, what: str) -> npt.NDArray[Any]:
