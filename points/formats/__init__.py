@@ -9,7 +9,7 @@ import errno
 from pathlib import Path, PurePath
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile, StraightPCFError, UnknownFormat
+from straightpcf.points.errors import MalformedFile, StraightPCFError, TooManyBytes, UnknownFormat
 from straightpcf.points.formats.base import DEFAULT_MAX_POINTS, HEAD_BYTES, Format
 from straightpcf.points.formats.kitti import Kitti
 from straightpcf.points.formats.las import Las, Laz
@@ -47,8 +47,10 @@ def read_cloud(
     format = _recognised(head, called)
     try:
         return format.read(path, max_points=max_points), format
-    except (StraightPCFError, MemoryError):
+    except StraightPCFError:
         raise
+    except MemoryError as exc:
+        raise TooManyBytes(f"{called} ({path.stat().st_size} bytes) does not fit into this machine's memory") from exc
     except Exception as exc:
         if isinstance(exc, OSError) and exc.errno not in (None, errno.EINVAL):
             raise  # the disk, not the file; EINVAL is a seek to where a broken file pointed
