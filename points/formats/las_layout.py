@@ -185,7 +185,9 @@ def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.
             shift += bits
     for name, code, width in _extra_dimensions(header, at):
         size = np.dtype(code).itemsize * width
-        label = name if name not in found and name not in "xyzXYZ" else f"extra_{name}"
+        label = name
+        while label in found or label in tuple("xyzXYZ"):
+            label = f"extra_{label}"
         found[label] = rows[:, at : at + size] if width > 1 else _column(rows, at, code)
         at += size
     if at < header.row_bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -94,10 +95,22 @@ def _extra_bytes_record(extra: dict[str, npt.NDArray[Any]]) -> bytes:
     if not extra:
         return b""
     body = b"".join(
-        struct.pack("<2xBx32s156x", _TYPES.index(values.dtype.str[1:]) + 1, name.encode()[:32])
-        for name, values in extra.items()
+        struct.pack("<2xBx32s156x", _TYPES.index(values.dtype.str[1:]) + 1, name)
+        for name, values in zip(_short_names(extra), extra.values(), strict=True)
     )
     return struct.pack("<H16sHH32s", 0, b"LASF_Spec", 4, len(body), b"Extra Bytes Record") + body
+
+
+def _short_names(names: Iterable[str]) -> list[bytes]:
+    """Cut names to the 32 bytes that a record has for each, numbered where they would then be the same."""
+    short: list[bytes] = []
+    for name in names:
+        cut, number = name.encode()[:32], 2
+        while cut in short:
+            suffix = b"_%d" % number
+            cut, number = name.encode()[: 32 - len(suffix)] + suffix, number + 1
+        short.append(cut)
+    return short
 
 
 def _header(points: int, begin: int, records: int, point_format: int, row_bytes: int) -> bytes:

@@ -8,13 +8,17 @@ from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
-from straightpcf.points.errors import MalformedFile, MissingDependency, UnsupportedCloud
+import numpy as np
+
+from straightpcf.points.errors import MalformedFile, MissingDependency, TooManyBytes, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
 from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader
 
 __all__ = ["pack", "packing_record", "unpack"]
 
 VARIABLE_CHUNKS = 0xFFFFFFFF
+MAX_UNPACKED_BYTES = 4 << 30  # whatever the file's size: layers that never change take no byte at all
+MAX_USUAL_RATIO = 20  # scans pack 5 to 15 to 1; a file with more than MAX_UNPACKED_BYTES must be no better
 _POINTWISE, _LAYERED = 2, 3
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # item type -> layers of one chunk; type 14, extra bytes, has one a byte
 
@@ -49,6 +53,7 @@ def unpack(raw: bytes, header: LasHeader) -> bytearray:
     if record is None:
         raise MalformedFile("a LAZ file without a laszip record: nothing says how its points are packed")
     chunk_size = _check_record(record.data, header)
+    _check_unpacked(header.points * header.row_bytes, len(raw))
     _check_chunk_table(raw, header, chunk_size)
     with _converted():
         lazrs.LazVlr(record.data)
@@ -80,7 +85,10 @@ def packing_record(header: LasHeader) -> bytes:
 
 
 def pack(points: bytes, record: bytes, begin: int) -> bytes:
-    """Pack points; the chunk table's place counts from the file's start, and the points begin at byte `begin`."""
+    """Pack points; the chunk table's place counts from the file's start, and the points begin at byte `begin`.
+
+    Raises UnsupportedCloud where they do not unpack to the same bytes: lazrs 0.8 loses bits of some wave packets.
+    """
     lazrs = _lazrs()
     sink = BytesIO(bytes(begin))
     sink.seek(begin)
@@ -88,6 +96,14 @@ def pack(points: bytes, record: bytes, begin: int) -> bytes:
         packer = lazrs.LasZipCompressor(sink, lazrs.LazVlr(record))
         packer.compress_many(points)
         packer.done()
+        sink.seek(begin)
+        again = bytearray(len(points))
+        if points:
+            lazrs.LasZipDecompressor(sink, record).decompress_many(again)
+    if again != points:
+        differs = np.frombuffer(again, np.uint8) != np.frombuffer(points, np.uint8)
+        row = int(np.argmax(differs)) // sum(size for _, size, _ in _items(record))
+        raise UnsupportedCloud(f"lazrs cannot pack point {row} as LAZ without loss; write LAS")
     return sink.getvalue()[begin:]
 
 
@@ -111,6 +127,13 @@ def _check_record(record: bytes, header: LasHeader) -> int:
     if chunk_size == 0:
         raise MalformedFile("the laszip record declares chunks of 0 points")
     return int(chunk_size)
+
+
+def _check_unpacked(unpacked: int, packed: int) -> None:
+    """Refuse a bomb: a few kilobytes of LAZ can be valid and unpack to hundreds of gigabytes."""
+    limit = max(MAX_UNPACKED_BYTES, MAX_USUAL_RATIO * packed)
+    if unpacked > limit:
+        raise TooManyBytes(f"the LAZ points declare {unpacked} bytes unpacked; the limit for {packed} bytes is {limit}")
 
 
 def _check_chunk_table(raw: bytes, header: LasHeader, chunk_size: int) -> None:

@@ -1,0 +1,133 @@
+"""LAS and LAZ where they could lose something or take too much: lossy packing, bombs, names, waveforms."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, MissingDependency, TooManyBytes, UnsupportedCloud
+from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from tests.clouds import torus
+from tests.points.foreign_samples import OTHER_SAMPLES
+
+laspy = pytest.importorskip("laspy", reason="laspy, of the extra straightpcf[dev], is not installed")
+N = 50
+
+
+def _waveform_file(path: Path, point_format: int, *, is_noise: bool) -> Path:
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.3")
+    header.scales = np.full(3, 0.01)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = torus(N).T
+    rows = cloud.points.array
+    if is_noise:
+        noise = np.random.default_rng(0).integers(0, 256, rows.nbytes, np.uint8)
+        rows[:] = np.frombuffer(noise.tobytes(), rows.dtype)
+    else:
+        rows["wavepacket_index"], rows["wavepacket_size"] = 1, 256
+        rows["wavepacket_offset"], rows["x_t"] = 60 + 256 * np.arange(N), np.linspace(0, 1, N)
+    cloud.write(path)
+    return path
+
+
+@pytest.mark.parametrize("point_format", [4, 5, 9, 10])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_moved_points_keep_their_wave_packets(point_format: int, suffix: str, tmp_path: Path) -> None:
+    before = _waveform_file(tmp_path / f"a{suffix}", point_format, is_noise=False)
+    cloud, format = read_cloud(before)
+    write_cloud(cloud.with_xyz(cloud.xyz + 0.5), after := tmp_path / f"b{suffix}", format)
+    again, _ = read_cloud(after)
+    for name, values in cloud.attributes.items():
+        assert again.attributes[name].tobytes() == values.tobytes(), name
+
+
+@pytest.mark.parametrize("point_format", [9, 10])
+def test_what_lazrs_cannot_pack_without_loss_is_refused_as_laz_and_kept_as_las(
+    point_format: int, tmp_path: Path
+) -> None:
+    """lazrs 0.8 drops bits of layered wave packets that jump; should it learn better, the fields must be equal."""
+    cloud, las = read_cloud(_waveform_file(tmp_path / "a.las", point_format, is_noise=True))
+    packed, laz = read_cloud(_waveform_file(tmp_path / "a.laz", point_format, is_noise=True))
+    middle = cloud.xyz * 0.5
+    try:
+        write_cloud(packed.with_xyz(packed.xyz * 0.5), tmp_path / "b.laz", laz)
+    except UnsupportedCloud as refusal:
+        assert "without loss; write LAS" in refusal.message  # noqa: PT017 - either outcome is right
+    else:
+        again, _ = read_cloud(tmp_path / "b.laz")
+        assert all(again.attributes[n].tobytes() == v.tobytes() for n, v in packed.attributes.items())
+    write_cloud(cloud.with_xyz(middle), tmp_path / "b.las", las)
+    again, _ = read_cloud(tmp_path / "b.las")
+    assert all(again.attributes[n].tobytes() == v.tobytes() for n, v in cloud.attributes.items())
+
+
+def test_points_that_come_out_of_lazrs_changed_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import lazrs
+
+    class Forgetful:
+        def __init__(self, sink: BytesIO, record: lazrs.LazVlr) -> None:
+            self._packer = compressor(sink, record)
+
+        def compress_many(self, points: bytes) -> None:
+            self._packer.compress_many(points[:-1] + bytes([points[-1] ^ 1]))
+
+        def done(self) -> None:
+            self._packer.done()
+
+    compressor = lazrs.LasZipCompressor
+    cloud, laz = read_cloud(OTHER_SAMPLES["laz 1.4 format 8"](tmp_path))
+    monkeypatch.setattr(lazrs, "LasZipCompressor", Forgetful)
+    with pytest.raises(UnsupportedCloud, match=f"point {len(cloud) - 1} as LAZ without loss"):
+        write_cloud(cloud.with_xyz(cloud.xyz + 1), tmp_path / "b.laz", laz)
+
+
+def test_a_laz_bomb_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    """A layer that never changes takes no byte, so points may declare any number; here 60 say they are 300 million."""
+    path = OTHER_SAMPLES["laz 1.4 format 8"](tmp_path)
+    broken = bytearray(path.read_bytes())
+    struct.pack_into("<Q", broken, 247, 300_000_000)
+    path.write_bytes(broken)
+    with pytest.raises(TooManyBytes, match=r"\d{11} bytes unpacked; the limit for \d+ bytes is 4294967296"):
+        read_cloud(path, max_points=2**40)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_cut_file_is_malformed(suffix: str, tmp_path: Path) -> None:
+    name = "las 1.4 format 7" if suffix == ".las" else "laz 1.4 format 8"
+    path = OTHER_SAMPLES[name](tmp_path)
+    whole = path.read_bytes()
+    begin = struct.unpack_from("<I", whole, 96)[0]
+    for length in (100, 226, 300, begin - 1, begin + 4, begin + 30):
+        path.write_bytes(whole[:length])
+        with pytest.raises(MalformedFile):
+            read_cloud(path)
+
+
+def test_laz_without_lazrs_names_the_extra_and_las_needs_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = OTHER_SAMPLES["laz 1.2 format 1"](tmp_path)
+    plain = OTHER_SAMPLES["las 1.2 format 3"](tmp_path)
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    cloud, _ = read_cloud(plain)
+    with pytest.raises(MissingDependency, match=r"pip install 'straightpcf\[las\]'"):
+        read_cloud(packed)
+    with pytest.raises(MissingDependency, match=r"pip install 'straightpcf\[las\]'"):
+        write_cloud(cloud, tmp_path / "b.laz", format_named("laz"))
+
+
+def test_attributes_whose_long_names_begin_alike_all_come_back(tmp_path: Path) -> None:
+    """LAS has 32 bytes for the name of an extra dimension."""
+    attributes = {f"{'n' * 40}{i}": np.random.default_rng(i).random(N) for i in range(12)}
+    write_cloud(PointCloud(torus(N), attributes), path := tmp_path / "a.las", format_named("las"))
+    cloud, _ = read_cloud(path)
+    kept = [values for name, values in cloud.attributes.items() if "nnn" in name]
+    assert len(kept) == 12
+    for values, expected in zip(kept, attributes.values(), strict=True):
+        np.testing.assert_array_equal(values, expected)
+    theirs = laspy.read(path)
+    assert len(set(theirs.point_format.extra_dimension_names)) == 12
