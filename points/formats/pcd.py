@@ -141,14 +141,15 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
     )
     parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
     starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
-    left = header.points
+    left, line = header.points, header.lines + 1
     for lines, _ in blocks(raw, header.size) if left else ():
-        rows = lines.head(left)
-        line = header.lines + 1 + header.points - left
+        filled = np.flatnonzero(lines.counts)[:left]  # PCL skips blank lines
+        rows, numbers = lines.pick(filled), line + filled
+        line += len(lines)
         wrong = rows.counts != width
         if wrong.any():
             row = int(np.argmax(wrong))
-            raise MalformedFile(f"line {line + row} has {rows.counts[row]} values, the PCD fields have {width}")
+            raise MalformedFile(f"line {numbers[row]} has {rows.counts[row]} values, the PCD fields have {width}")
         columns, at = {}, 0
         for field in header.fields:
             index = (rows.first[:, None] + np.arange(at, at + field.count)).reshape(-1)
@@ -158,9 +159,8 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
             values, bad = read(raw, first, last) if read else as_integers(raw, first, last, field.dtype)
             if bad is not None:
                 token = shown(raw[first[bad] : last[bad]])
-                raise MalformedFile(
-                    f"line {line + bad // field.count}: {field.label} is {token}, no {field.dtype.name}"
-                )
+                number = numbers[bad // field.count]
+                raise MalformedFile(f"line {number}: {field.label} is {token}, no {field.dtype.name}")
             parts[field.label].append(values if field.count == 1 else values.reshape(-1, field.count))
             at += field.count
         starts.append(np.stack([columns[axis][0] for axis in AXES], axis=1))

@@ -1,0 +1,99 @@
+"""PCD of every encoding: what moves is rewritten in place, blank lines and comments stay, sizes are checked first."""
+
+from __future__ import annotations
+
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.formats import format_named, lzf, read_cloud, write_cloud
+from tests.clouds import torus
+from tests.points.foreign_samples import pcd
+
+HEADER = (
+    b"# made by hand\nVERSION .7\n# two\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    b"WIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA ascii\n"
+)
+
+
+def _read(folder: Path, raw: bytes) -> PointCloud:
+    (path := folder / "a.pcd").write_bytes(raw)
+    return read_cloud(path)[0]
+
+
+def _written(folder: Path, cloud: PointCloud) -> bytes:
+    write_cloud(cloud, out := folder / "out.pcd", format_named("pcd"))
+    return out.read_bytes()
+
+
+def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None:
+    raw = HEADER + b"\n1 2 3 7\n\n \t\n4 5 6 8\r\n\r\nnan nan nan 9\n\nrest"
+    cloud = _read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz[:2], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(cloud.attributes["label"], [7, 8, 9])
+    assert _written(tmp_path, cloud) == raw
+    xyz = cloud.xyz.copy()
+    xyz[1, 2] = 6.5
+    assert _written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"4 5 6 8", b"4 5 6.5 8")
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (b"1 2 3 7\n\n4 5 6\n7 8 9 1\n", r"line 15 has 3 values, the PCD fields have 4"),
+        (b"1 2 3 7\n\n4 5 six 8\n7 8 9 1\n", r"line 15: z is 'six'"),
+        (b"1 2 3 7\n\n\n4 5 6 -8\n7 8 9 1\n", r"line 16: label is '-8', no uint32"),
+        (b"1 2 3 7\n\n4 5 6 8\n\n\n\n\n\n\n\n\n\n", r"POINTS is 3, the file ends after 2: it is truncated"),
+        (b"1 2 3 7\n4 5 6 8\n", r"needs at least 23 bytes, the file has 16: it is truncated"),
+        (b"1 2 3 7\n4 5 6 8\n\0 2 3 4567890\n", r"0x00"),
+    ],
+)
+def test_a_broken_line_is_named_by_its_number_in_the_file(body: bytes, message: str, tmp_path: Path) -> None:
+    with pytest.raises(MalformedFile, match=message):
+        _read(tmp_path, HEADER + body)
+
+
+def test_a_moved_binary_file_differs_in_nothing_but_the_moved_floats(tmp_path: Path) -> None:
+    raw = pcd("binary")
+    cloud = _read(tmp_path, raw)
+    xyz = cloud.xyz.copy()
+    xyz[20] += 1
+    out = _written(tmp_path, cloud.with_xyz(xyz))
+    differs = np.flatnonzero(np.frombuffer(out, np.uint8) != np.frombuffer(raw, np.uint8))
+    row = 4 + 4 + 3 + 4 + 8 + 4 + 4
+    begin = raw.index(b"DATA binary\n") + 12 + 20 * row
+    assert len(out) == len(raw)
+    assert differs.min() >= begin + 4
+    assert differs.max() < begin + 23
+    assert not set(range(8, 11)) & set((differs - begin).tolist())  # the padding
+
+
+@pytest.mark.parametrize(("packed", "size"), [(0, 2**32 - 1), (4, -4), (0, 0)])
+def test_sizes_of_compressed_data_that_cannot_be_are_refused(packed: int, size: int, tmp_path: Path) -> None:
+    raw = bytearray(pcd("binary_compressed"))
+    at = raw.index(b"binary_compressed\n") + 18
+    struct.pack_into("<I", raw, at + packed, size % 2**32)
+    with pytest.raises(MalformedFile, match=r"truncated|unpacked|LZF"):
+        _read(tmp_path, bytes(raw))
+
+
+def test_a_moved_value_that_float32_cannot_hold_is_named(tmp_path: Path) -> None:
+    cloud = _read(tmp_path, pcd("binary"))
+    with pytest.raises(UnsupportedCloud, match=r"1e\+300 does not fit into float32"):
+        _written(tmp_path, cloud.with_xyz(np.full_like(cloud.xyz, 1e300)))
+
+
+def test_five_megabytes_of_lzf_take_seconds_at_worst() -> None:
+    raw = torus(416_000).astype("<f4").tobytes()
+    began = time.monotonic()
+    packed = lzf.compress(raw)
+    assert lzf.decompress(packed, len(raw)) == raw
+    assert len(packed) < 1.04 * len(raw)
+    short_matches = b"\x00a" + b"\x20\x00" * 800_000
+    assert lzf.decompress(short_matches, 2_400_001) == b"a" * 2_400_001
+    assert time.monotonic() - began < 10
