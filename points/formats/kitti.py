@@ -43,7 +43,9 @@ class Kitti(Format):
         size = path.stat().st_size
         check_count(size // ROW_BYTES, max_points, where=f"a KITTI frame of {size} bytes")
         if size % ROW_BYTES:
-            raise MalformedFile(f"a KITTI frame has {ROW_BYTES} bytes a point; {size} bytes end within one")
+            raise MalformedFile(
+                f"a KITTI frame has {ROW_BYTES} bytes a point; of {size} bytes the last {size % ROW_BYTES} are none"
+            )
         raw = path.read_bytes()
         rows = np.frombuffer(raw, "<f4").reshape(-1, 4)
         xyz = widened([rows[:, axis] for axis in range(3)])

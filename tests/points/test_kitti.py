@@ -1,0 +1,66 @@
+"""KITTI frames: rows that did not move keep their bits, a length that is no whole row is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from straightpcf.points.errors import MalformedFile, TooManyPoints, UnknownFormat, UnsupportedCloud
+from straightpcf.points.formats import read_cloud, write_cloud
+from tests.clouds import torus
+
+N = 40
+
+
+@pytest.fixture
+def frame(tmp_path: Path) -> Path:
+    rows = np.empty((N, 4), "<f4")
+    rows[:, :3], rows[:, 3] = torus(N), np.linspace(0, 1, N)
+    bits = rows.view("<u4")
+    bits[3, 0], bits[4, 1], bits[5, 3] = 0x7F800001, 0xFFC12345, 0x7FA00000  # NaN of three kinds, one in the intensity
+    rows[6, 2] = -0.0
+    (path := tmp_path / "000000.bin").write_bytes(rows.tobytes())
+    return path
+
+
+def test_rows_that_did_not_move_keep_their_bits(frame: Path) -> None:
+    cloud, format = read_cloud(frame)
+    assert format.name == "kitti"
+    write_cloud(cloud.with_xyz(cloud.xyz.copy()), out := frame.with_name("out.bin"), format)
+    assert out.read_bytes() == frame.read_bytes()
+    xyz = cloud.xyz.copy()
+    xyz[::10] += 0.5
+    write_cloud(cloud.with_xyz(xyz), out, format)
+    before, after = (np.fromfile(path, "<u4").reshape(-1, 4) for path in (frame, out))
+    still = np.arange(N) % 10 != 0
+    np.testing.assert_array_equal(after[still], before[still])
+    np.testing.assert_array_equal(after[:, 3], before[:, 3])
+    np.testing.assert_array_equal(after.view("<f4")[::10, :3], xyz[::10].astype("<f4"))
+
+
+@pytest.mark.parametrize("over", [1, 4, 15])
+def test_a_length_that_is_no_whole_row_is_refused_naming_what_is_over(over: int, frame: Path) -> None:
+    frame.write_bytes(frame.read_bytes() + bytes(over))
+    with pytest.raises(MalformedFile, match=rf"of {16 * N + over} bytes the last {over} are none"):
+        read_cloud(frame)
+
+
+def test_more_points_than_the_limit_are_refused_unread(frame: Path) -> None:
+    with frame.open("r+b") as file:
+        file.truncate(16_000_000_000)  # sparse
+    with pytest.raises(TooManyPoints, match="1000000000 points; the limit is 1000"):
+        read_cloud(frame, max_points=1000)
+
+
+def test_only_the_suffix_says_that_a_file_is_a_frame(frame: Path) -> None:
+    with pytest.raises(UnknownFormat):
+        read_cloud(frame.rename(frame.with_name("frame")))
+
+
+def test_a_position_that_float32_cannot_hold_is_named(frame: Path) -> None:
+    cloud, format = read_cloud(frame)
+    with pytest.raises(UnsupportedCloud, match=r"1e\+39 does not fit into float32"):
+        write_cloud(cloud.with_xyz(np.full_like(cloud.xyz, 1e39)), frame, format)
+    assert frame.stat().st_size == 16 * N
