@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -19,14 +19,17 @@ class Calibration:
     """The table and the limits that `auto` uses; measured by `model.train.calibrate`, kept with the weights.
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
-    one_pass: d up to which one pass is enough; stop: d below which a cloud counts as clean after a pass.
-    most: never more passes than this.
+    Another pass is made while all of this holds: the last one moved its points by more than `settled` (median, in
+    the frame the network sees); it left d above `still_noisy`, or brought it down to less than `falls` of what it
+    was; fewer than `most` were made. d alone cannot decide: on thin and intricate shapes it stays high, and hardly
+    falls, when the noise is gone.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
-    one_pass: float = 0.6
-    stop: float = 0.3
+    settled: float = 0.008
+    still_noisy: float = 0.62
+    falls: float = 0.72
     most: int = 4
 
     def __post_init__(self) -> None:
@@ -54,8 +57,15 @@ class Calibration:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
 
-    def passes_left(self, distance: float, *, done: int) -> int:
-        """Say how many passes to go, given the cloud's median d before the next one: 0, 1, or 2 for "at least"."""
-        if done >= self.most or (done > 0 and distance < self.stop):
+    def passes_left(self, moves: Sequence[float], distances: Sequence[float]) -> int:
+        """Say how many passes to go: 0, 1, or 2 for "one or more".
+
+        moves: the median displacement of each pass made; distances: d before each of them, and now.
+        """
+        done = len(moves)
+        if done >= self.most or (done > 0 and not self._noise_is_left(moves[-1], distances[done - 1], distances[done])):
             return 0
-        return 1 if distance < self.one_pass or done == self.most - 1 else 2
+        return 1 if done == self.most - 1 else 2
+
+    def _noise_is_left(self, move: float, before: float, after: float) -> bool:
+        return move > self.settled and (after > self.still_noisy or after < self.falls * before)

@@ -38,7 +38,8 @@ class FinishedPatch:
     """Points whose position in this pass is settled: no other patch of the pass changes them.
 
     indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
-    final: whether this is the last pass; progress: 0..1, of the whole job as far as it can be foreseen.
+    final: whether this is known to be the last pass, which `auto` finds out only afterwards;
+    progress: 0..1, of the whole job as far as it can be foreseen.
     """
 
     indices: npt.NDArray[np.int64]
@@ -132,7 +133,7 @@ class Filter:
         return run.result(time.monotonic() - began)
 
     def patches(self, xyz: npt.NDArray[np.float64], options: DenoiseOptions | None = None) -> Iterator[FinishedPatch]:
-        """Yield patches of (N, 3) points as they are settled; those with `final` add up to the result.
+        """Yield patches of (N, 3) points as they are settled; the last position given for a point is its result.
 
         Rows that are not finite belong to no patch. Order and batching never change a position.
         """
@@ -156,6 +157,7 @@ class Run:
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.noise = [0.0, 0.0]
         self.distances: list[float] = []
+        self.moves: list[float] = []  # the median displacement of each pass, in the frame the network sees
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
@@ -192,17 +194,19 @@ class Run:
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
-        return self.filter.calibration.passes_left(self.distances[-1], done=self.iterations)
+        return self.filter.calibration.passes_left(self.moves, self.distances)
 
     def _pass(
         self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor, left: int
     ) -> Iterator[FinishedPatch]:
         scales = patch_scales(cut.radii)
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
+        lengths = np.empty(len(here), dtype=np.float32)
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for n, (patch, displacement) in enumerate(self._displacements(here, cut, scales, pool), start=1):
             rows = cut.owned_rows(patch)
             owned = cut.index[patch][rows]
+            lengths[owned] = np.linalg.norm(displacement[rows], axis=1)
             self.moved[owned] += displacement[rows] / scales[patch]
             copies = self.points.copies(owned)
             indices = self.rows[copies]
@@ -210,6 +214,7 @@ class Run:
             xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
             progress = (done_before + n / len(cut.seeds)) * share
             yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
+        self.moves.append(float(np.median(lengths)))
 
     def _displacements(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,11 +24,12 @@ _PASS_PENALTY = 0.003
 
 @dataclass(frozen=True)
 class Trace:
-    """One noisy cloud on its way: d before each pass and after the last, CD after 0, 1, ... passes."""
+    """One noisy cloud on its way: d before each pass and after the last, each pass's move, CD from 0 passes on."""
 
     cloud: str
     noise_std: float
     distances: tuple[float, ...]
+    moves: tuple[float, ...]
     chamfer: tuple[float, ...]
 
 
@@ -37,10 +37,11 @@ def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std:
     """Add Gaussian noise of `noise_std` radii to a clean unit-sphere cloud (N, 3) and filter it pass by pass."""
     noisy = clean + noise_std * np.random.default_rng(seed).standard_normal(clean.shape)
     run = Run(filter_, noisy, DenoiseOptions(iterations=_MOST_PASSES))
-    states = {0: noisy.copy()}
+    states = {0: noisy}
     for patch in run.patches():
-        states.setdefault(patch.iteration, states[0].copy())[patch.indices] = patch.xyz
-    return Trace(name, noise_std, tuple(run.distances), tuple(chamfer_distance(x, clean) for x in states.values()))
+        states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
+    chamfer = tuple(chamfer_distance(x, clean) for x in states.values())
+    return Trace(name, noise_std, tuple(run.distances), tuple(run.moves), chamfer)
 
 
 def calibrate(
@@ -55,27 +56,25 @@ def calibrate(
     traces = [trace(filter_, name, clean, std) for name, clean in clouds.items() for std in noise_stds]
     table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in sorted(noise_stds)])
     base = Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table), most=_MOST_PASSES)
-    limits = np.round(np.arange(0.02, 1.0, 0.02), 2)
-    pairs = [(one, stop) for one, stop in itertools.product(limits, limits) if stop <= one]
-    one_pass, stop = min(pairs, key=lambda pair: _regret(replace(base, one_pass=pair[0], stop=pair[1]), traces))
-    return replace(base, one_pass=float(one_pass), stop=float(stop)), traces
+    limits = [n / 4000 for n in range(8, 81)]  # 0.002 to 0.02
+    best = [_regret(replace(base, settled=limit), traces) for limit in limits]
+    ties = [limit for limit, regret in zip(limits, best, strict=True) if regret <= min(best) + 1e-9]
+    return replace(base, settled=ties[len(ties) // 2]), traces  # the middle of what serves equally well
 
 
-def passes(calibration: Calibration, distances: Sequence[float]) -> int:
+def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
-    while left := calibration.passes_left(distances[done], done=done):
+    while calibration.passes_left(recorded.moves[:done], recorded.distances[: done + 1]):
         done += 1
-        if left == 1:
-            break
     return done
 
 
 def _regret(calibration: Calibration, traces: Sequence[Trace]) -> float:
-    """Mean log of CD over the best CD; clean clouds have no best, and count by what they lose absolutely."""
+    """Mean log of CD over the best CD, on the noisy clouds."""
     total = 0.0
     for t in traces:
-        done = passes(calibration, t.distances)
+        done = passes(calibration, t)
         if t.noise_std > 0:
             total += float(np.log(t.chamfer[done] / min(t.chamfer[1:]))) + _PASS_PENALTY * done
     return total
