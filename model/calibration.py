@@ -19,17 +19,18 @@ class Calibration:
     """The table and the limits that `auto` uses; measured by `model.train.calibrate`, kept with the weights.
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
-    Another pass is made while all of this holds: the last one moved its points by more than `settled` (median, in
-    the frame the network sees); it left d above `still_noisy`, or brought it down to less than `falls` of what it
-    was; fewer than `most` were made. d alone cannot decide: on thin and intricate shapes it stays high, and hardly
-    falls, when the noise is gone.
+    Another pass is made while all of this holds: d was above `noisy` at the start; the last pass moved its points
+    by more than `settled` (median, in the frame the network sees); it left d above `still_noisy`, or brought it down
+    to less than `falls` of what it was; fewer than `most` were made. d after a pass cannot decide alone: on thin and
+    intricate shapes it stays high, and hardly falls, when the noise is gone.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
+    noisy: float = 0.67
     settled: float = 0.008
-    still_noisy: float = 0.62
-    falls: float = 0.72
+    still_noisy: float = 0.6
+    falls: float = 0.75
     most: int = 4
 
     def __post_init__(self) -> None:
@@ -63,9 +64,11 @@ class Calibration:
         moves: the median displacement of each pass made; distances: d before each of them, and now.
         """
         done = len(moves)
-        if done >= self.most or (done > 0 and not self._noise_is_left(moves[-1], distances[done - 1], distances[done])):
+        if done >= self.most or (done > 0 and not self._noise_is_left(moves, distances)):
             return 0
         return 1 if done == self.most - 1 else 2
 
-    def _noise_is_left(self, move: float, before: float, after: float) -> bool:
-        return move > self.settled and (after > self.still_noisy or after < self.falls * before)
+    def _noise_is_left(self, moves: Sequence[float], distances: Sequence[float]) -> bool:
+        before, after = distances[len(moves) - 1 :][:2]
+        works = after > self.still_noisy or after < self.falls * before
+        return distances[0] > self.noisy and moves[-1] > self.settled and works
