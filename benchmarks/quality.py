@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
+from benchmarks.conventional import jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.filter import Filter, load_filter
@@ -98,6 +99,8 @@ def _shapes(options: argparse.Namespace, resolution: int) -> list[Shape]:
 def _runner(options: argparse.Namespace) -> Run:
     if options.model == "noisy":
         return lambda cloud, _: (cloud, 0)
+    if options.model == "jet":
+        return jet_smooth
     if options.model == "official":
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
         if not isinstance(module, VelocityModule):
@@ -185,7 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument("--iterations", default="auto", help='"auto" or a number of passes')
     parser.add_argument("--shapes", nargs="+", help="only these")
-    parser.add_argument("--model", choices=("ours", "official", "noisy"), default="ours")
+    parser.add_argument("--model", choices=("ours", "official", "jet", "noisy"), default="ours")
     parser.add_argument("--weights", type=Path, help="the shipped ones, or the authors' with --model official")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--threads", type=int, help="CPU threads, all by default")
