@@ -59,13 +59,15 @@ def train(
     seed: int = 0,
     device: str = "cpu",
     threads: int | None = None,
+    minutes: float | None = None,
     init: Path | None = None,
     on_step: Callable[[TrainStep], None] | None = None,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
     init: the state of the stage before (needed by "cvm" and "dm" on a fresh run). rows: points of a patch
-    in the loss. The learning rate warms up, then falls along half a cosine to 2 % at `iterations`.
+    in the loss. The learning rate warms up, then falls along half a cosine to 2 % at `iterations`. minutes: stop
+    there with the state saved, to go on another time (a GPU may be lent for ten minutes at once).
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
     and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
     """
@@ -104,19 +106,20 @@ def train(
         for iteration in range(start + 1, iterations + 1):
             rate = _learning_rate(learning_rate, iteration, iterations)
             loss = step(rate)
-            average.update(network, iteration)
+            average.update(iteration)
+            last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
             # On CUDA reading the loss waits for the device: only where it is reported.
-            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or iteration == iterations:
+            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last:
                 recent.append(loss.item())
                 if not math.isfinite(recent[-1]):
                     raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
                 recent_loss = recent[-1]
-            if iteration % _VALIDATE_EVERY == 0 or iteration == iterations:
+            if iteration % _VALIDATE_EVERY == 0 or last:
                 validation = _validate(stage, network, average, fixed.to(place), rows)
                 progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
                             "learning_rate": learning_rate, "validation": validation}  # fmt: skip
                 save_state(state_path, network, average, optimiser, rng, progress)
-            if iteration % _LOG_EVERY == 0 or iteration == iterations:
+            if iteration % _LOG_EVERY == 0 or last:
                 seconds = round(time.monotonic() - began, 1)
                 log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
                 file.flush()
@@ -124,6 +127,8 @@ def train(
             if on_step is not None:
                 on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
             validation = None
+            if last:
+                break
     return state_path
 
 

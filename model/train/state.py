@@ -22,18 +22,18 @@ class Average:
 
     def __init__(self, network: StraightPCF, decay: float) -> None:
         self.decay = decay
-        self.tensors = {name: t.detach().clone() for name, t in network.state_dict().items()}
+        live = network.state_dict()
+        self.tensors = {name: t.detach().clone() for name, t in live.items()}
+        self._live = live  # shares storage with the network, so it is looked up once, not every iteration
 
     @torch.no_grad()
-    def update(self, network: StraightPCF, iteration: int) -> None:
+    def update(self, iteration: int) -> None:
         """Take one step; early on the window is short, so that the random start is forgotten."""
         decay = min(self.decay, (1 + iteration) / (10 + iteration))
-        for name, tensor in network.state_dict().items():
-            mean = self.tensors[name]
-            if mean.is_floating_point():
-                mean.lerp_(tensor, 1 - decay)
-            else:
-                mean.copy_(tensor)
+        smooth = [name for name, mean in self.tensors.items() if mean.is_floating_point()]
+        torch._foreach_lerp_([self.tensors[n] for n in smooth], [self._live[n] for n in smooth], 1 - decay)
+        for name in self.tensors.keys() - set(smooth):
+            self.tensors[name].copy_(self._live[name])
 
 
 def save_state(

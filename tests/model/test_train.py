@@ -109,3 +109,8 @@ def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> Non
               on_step=lambda step: seen.append(step.iteration))  # fmt: skip
     assert seen == [1, 2, 3, 4]
     assert (tmp_path / "log.csv").read_text().count("stage") == 1
+
+
+def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
+    path = train("vm", data=data, run_dir=tmp_path, iterations=100, batch_size=2, threads=1, minutes=0.0)
+    assert read_network(path)[1]["iteration"] == 1
