@@ -129,11 +129,13 @@ class _VelocityOnly(nn.Module):
     def distance_module(self, x: torch.Tensor) -> torch.Tensor:
         return x.new_ones(len(x), 1)
 
-    def forward(self, x: torch.Tensor, *, euler_steps: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, *, euler_steps: int, rows: int | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         del euler_steps  # the filter's default is that of the whole network
-        for _ in range(OFFICIAL_STEPS):
+        for _ in range(OFFICIAL_STEPS - 1):
             x = x + self.module(x) / OFFICIAL_STEPS
-        return x, x.new_ones(len(x), 1)
+        return x[:, :rows] + self.module(x, rows) / OFFICIAL_STEPS, x.new_ones(len(x), 1)
 
 
 def _print(row: Row) -> None:

@@ -204,10 +204,9 @@ class Run:
         lengths = np.empty(len(here), dtype=np.float32)
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for n, (patch, displacement) in enumerate(self._displacements(here, cut, scales, pool), start=1):
-            rows = cut.owned_rows(patch)
-            owned = cut.index[patch][rows]
-            lengths[owned] = np.linalg.norm(displacement[rows], axis=1)
-            self.moved[owned] += displacement[rows] / scales[patch]
+            owned = cut.owned_points(patch)
+            lengths[owned] = np.linalg.norm(displacement, axis=1)
+            self.moved[owned] += displacement / scales[patch]
             copies = self.points.copies(owned)
             indices = self.rows[copies]
             moved = self.moved[self.points.inverse[copies]]
@@ -219,18 +218,21 @@ class Run:
     def _displacements(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
     ) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
-        """Run the network over all patches; yield each one's (P, 3) displacement in its own scale."""
+        """Run the network over all patches; yield each one's displacements of the points it owns, in its own scale."""
         step = 1 if self.filter.device == "cpu" else _CUDA_BATCH
 
         def move(first: int) -> npt.NDArray[np.float64]:
-            x = self._tensor(here, cut, scales, range(first, min(first + step, len(cut.seeds))))
-            moved, _ = self.filter.network(x, euler_steps=self.filter.euler_steps)
-            return (moved - x).double().cpu().numpy()  # type: ignore[no-any-return]
+            chosen = range(first, min(first + step, len(cut.seeds)))
+            rows = max(1, int(cut.owned[first : chosen.stop].max()))
+            x = self._tensor(here, cut, scales, chosen)
+            moved, _ = self.filter.network(x, euler_steps=self.filter.euler_steps, rows=rows)
+            return (moved - x[:, :rows]).double().cpu().numpy()  # type: ignore[no-any-return]
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
         for first, displacements in zip(starts, results, strict=True):
-            yield from enumerate(displacements, start=first)
+            for patch, displacement in enumerate(displacements, start=first):
+                yield patch, displacement[: cut.owned[patch]]
 
     def _tensor(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], chosen: range | list[int]

@@ -19,18 +19,20 @@ _TREE_HEIGHT = 7  # of the sampler's buckets; their number may not pass the numb
 class Patches:
     """M patches of P points of one cloud.
 
-    seeds: (M,) int64 rows; index: (M, P) int32 rows, nearest to the seed first; radii: (M,) float64 distance
-    to the farthest; owner: (N,) int32, the patch that has the last word on each point.
+    seeds: (M,) int64 rows; index: (M, P) int32 rows, the points that the patch owns first, then the others, each
+    part nearest to the seed first; owned: (M,) int64, how many it owns; radii: (M,) float64 distance to the
+    farthest; owner: (N,) int32, the patch that has the last word on each point.
     """
 
     seeds: npt.NDArray[np.int64]
     index: npt.NDArray[np.int32]
+    owned: npt.NDArray[np.int64]
     radii: npt.NDArray[np.float64]
     owner: npt.NDArray[np.int32]
 
-    def owned_rows(self, patch: int) -> npt.NDArray[np.intp]:
-        """Return the positions inside a patch of the points that it owns."""
-        return np.flatnonzero(self.owner[self.index[patch]] == patch)
+    def owned_points(self, patch: int) -> npt.NDArray[np.int32]:
+        """Return the rows of the cloud that a patch owns."""
+        return self.index[patch, : self.owned[patch]]
 
 
 def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE) -> Patches:
@@ -59,7 +61,10 @@ def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, pat
         covered[more_index] = True
         seeds = np.concatenate([seeds, more])
         distance, index = np.concatenate([distance, more_distance]), np.concatenate([index, more_index])
-    return Patches(seeds, index, distance[:, -1].astype(np.float64), _owners(distance, index, count))
+    owner = _owners(distance, index, count)
+    owns = owner[index] == np.arange(len(seeds), dtype=np.int32)[:, None]
+    index = np.take_along_axis(index, np.argsort(~owns, axis=1, kind="stable"), axis=1)
+    return Patches(seeds, index, owns.sum(axis=1), distance[:, -1].astype(np.float64), owner)
 
 
 def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDArray[np.int64]:

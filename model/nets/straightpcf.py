@@ -52,14 +52,17 @@ class StraightPCF(nn.Module):
         self.velocity_modules = nn.ModuleList(VelocityModule(width) for _ in range(couplings))
         self.distance_module = DistanceModule(distance_width)
 
-    def forward(self, x: torch.Tensor, *, euler_steps: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, x: torch.Tensor, *, euler_steps: int = 3, rows: int | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
 
-        Returns the moved patches (B, P, 3) and their distances d (B, 1).
+        Returns the moved patches (B, P, 3), or their first `rows` points, for which the last evaluation costs
+        less, and their distances d (B, 1).
         """
         distance = self.distance_module(x)
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
-        for _ in range(euler_steps):
-            for velocity in self.velocity_modules:
-                x = x + step * velocity(x)
-        return x, distance
+        evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
+        for velocity in evaluations[:-1]:
+            x = x + step * velocity(x)
+        return x[:, :rows] + step * evaluations[-1](x, rows), distance

@@ -25,7 +25,7 @@ def test_every_point_has_an_owner_that_contains_it(count: int, coverage: float, 
     elif clump == "equal":
         xyz[: count // 2 + 1] = xyz[0]
     cut = cut_patches(xyz, coverage=coverage, seed=seed, patch_size=200)
-    owned = np.concatenate([cut.index[m][cut.owned_rows(m)] for m in range(len(cut.seeds))])
+    owned = np.concatenate([cut.owned_points(m) for m in range(len(cut.seeds))])
     assert np.array_equal(np.sort(owned), np.arange(count))
 
 
@@ -43,7 +43,7 @@ def test_the_owner_is_the_patch_that_is_nearest_in_its_own_radius() -> None:
 def test_a_cloud_smaller_than_a_patch_is_one_patch() -> None:
     cut = cut_patches(torus(700), coverage=3, seed=5)
     assert cut.index.shape == (1, 700)
-    assert cut.owned_rows(0).size == 700
+    assert cut.owned_points(0).size == 700
 
 
 @pytest.mark.parametrize("seed", [0, 17])
