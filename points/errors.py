@@ -12,9 +12,20 @@ StraightPCFError
 ├── TooLarge                a limit was passed
 │   ├── TooManyPoints
 │   └── TooManyBytes
+├── Unauthorized            no key, or an unknown one
+├── NotFound                no such thing, or not yours
+├── MethodNotAllowed
+├── JobNotFinished          its result is not there yet
+├── JobExpired              its result is not there any more
+├── JobCanceled
+├── IdConflict              the id belongs to another request
+├── IdempotencyConflict     the key belongs to another request
+├── RangeNotSatisfiable
 ├── DeviceUnavailable       the requested device is not here
 ├── ServerBusy              try again later
-├── JobCanceled
+│   ├── RateLimited         this key's requests per minute
+│   ├── QuotaExceeded       this key's jobs
+│   └── SpoolFull           the disk
 └── InternalError           our fault
     └── ConnectionFailed    the server did not answer (raised by the SDK)
 
@@ -29,19 +40,30 @@ __all__ = [
     "ERRORS_BY_CODE",
     "ConnectionFailed",
     "DeviceUnavailable",
+    "IdConflict",
+    "IdempotencyConflict",
     "InternalError",
     "InvalidCloud",
     "InvalidOptions",
     "InvalidRequest",
     "JobCanceled",
+    "JobExpired",
+    "JobNotFinished",
     "MalformedFile",
+    "MethodNotAllowed",
     "MissingDependency",
+    "NotFound",
+    "QuotaExceeded",
+    "RangeNotSatisfiable",
+    "RateLimited",
     "ServerBusy",
+    "SpoolFull",
     "StraightPCFError",
     "TooFewPoints",
     "TooLarge",
     "TooManyBytes",
     "TooManyPoints",
+    "Unauthorized",
     "UnknownFormat",
     "UnsupportedCloud",
 ]
@@ -138,10 +160,76 @@ class ServerBusy(StraightPCFError):  # noqa: N818
     retryable = True
 
 
+class RateLimited(ServerBusy):
+    """Report more requests than a key may send in a minute."""
+
+    code = "rate_limited"
+
+
+class QuotaExceeded(ServerBusy):
+    """Report more jobs than a key may hold at once."""
+
+    code = "quota_exceeded"
+
+
+class SpoolFull(ServerBusy):
+    """Report a disk with no room for another job."""
+
+    code = "spool_full"
+
+
+class Unauthorized(StraightPCFError):  # noqa: N818
+    """Report a missing or unknown API key."""
+
+    code = "unauthorized"
+
+
+class NotFound(StraightPCFError):  # noqa: N818
+    """Report something that is not here, or belongs to another key."""
+
+    code = "not_found"
+
+
+class MethodNotAllowed(StraightPCFError):  # noqa: N818
+    """Report a method that the path does not have."""
+
+    code = "method_not_allowed"
+
+
+class JobNotFinished(StraightPCFError):  # noqa: N818
+    """Report a job whose result is asked for too early."""
+
+    code = "job_not_finished"
+
+
+class JobExpired(StraightPCFError):  # noqa: N818
+    """Report a job whose files have been removed."""
+
+    code = "job_expired"
+
+
 class JobCanceled(StraightPCFError):  # noqa: N818
     """Report work that was canceled."""
 
     code = "job_canceled"
+
+
+class IdConflict(StraightPCFError):  # noqa: N818
+    """Report a job id that another request has taken."""
+
+    code = "id_conflict"
+
+
+class IdempotencyConflict(StraightPCFError):  # noqa: N818
+    """Report an idempotency key that came with another request before."""
+
+    code = "idempotency_conflict"
+
+
+class RangeNotSatisfiable(StraightPCFError):  # noqa: N818
+    """Report a byte range outside the file."""
+
+    code = "range_not_satisfiable"
 
 
 class InternalError(StraightPCFError):
