@@ -283,7 +283,7 @@ def _denoise_in_process(
             name=source.name,
             format=output_format,
         )
-        return denoise_file(denoiser, job, on_progress=show)
+        return denoise_file(denoiser, job, on_progress=lambda done, _: show(done))
 
 
 @contextmanager

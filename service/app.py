@@ -2,44 +2,46 @@
 
 from __future__ import annotations
 
+import ipaddress
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from types import FrameType
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
+from starlette.middleware.cors import CORSMiddleware
 
 import straightpcf
+from straightpcf.service.admission import Limits
+from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
+from straightpcf.service.api.jobs import router as jobs_router
 from straightpcf.service.api.request_id import RequestIdMiddleware
 from straightpcf.service.api.rest import router
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
-from straightpcf.service.engine import Engine, Limits
+from straightpcf.service.engine import Engine
 from straightpcf.service.settings import Settings
-from straightpcf.service.spool import Spool
+from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 
 __all__ = ["create_app", "serve"]
+
+logger = logging.getLogger("uvicorn.error")
 
 
 def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI:
     """Wire one server together; nothing starts before the app's lifespan does."""
-    limits = Limits(
-        max_bytes=settings.max_bytes,
-        max_points=settings.max_points,
-        max_jobs=settings.max_jobs,
-        max_wait_seconds=settings.max_wait_seconds,
-    )
-    engine = Engine(backend or _local_backend(settings), limits=limits)
+    engine = Engine(backend or _local_backend(settings), limits=_limits(settings), data_dir=settings.data_dir)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        with Spool(settings.data_dir) as app.state.spool:
-            await engine.start()
-            try:
-                yield
-            finally:
-                await engine.stop()
+        await engine.start()
+        try:
+            yield
+        finally:
+            await engine.stop()
 
     app = FastAPI(
         title="StraightPCF",
@@ -47,34 +49,88 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         summary="Hand it a noisy point cloud, get the same points back on the surface.",
         lifespan=lifespan,
     )
+    telemetry = Telemetry(engine)
     app.state.engine = engine
+    app.state.gate = Gate(settings.keys(), rate_per_minute=settings.rate_per_minute)
     app.state.weights = settings.weights.name if settings.weights else "shipped"
+    app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
+    if origins := [origin.strip() for origin in settings.cors_origins.split(",") if origin.strip()]:
+        app.add_middleware(
+            CORSMiddleware, allow_origins=origins, allow_methods=["*"], allow_headers=["*"], expose_headers=["*"]
+        )
     install_error_handlers(app)
     app.include_router(router)
+    app.include_router(jobs_router)
+    app.add_api_route(
+        "/metrics", telemetry.endpoint, include_in_schema=False, dependencies=[Depends(owner_of)], methods=["GET"]
+    )
     return app
 
 
 def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
     backend = _local_backend(settings)
+    app = create_app(settings, backend=backend)
     config = uvicorn.Config(
-        create_app(settings, backend=backend),
+        app,
         host=settings.host,
         port=settings.port,
         timeout_graceful_shutdown=settings.shutdown_seconds,
         lifespan="on",
         ws="none",
     )
-    server = uvicorn.Server(config)
+    server = _Server(config, app.state.engine)
 
     def end() -> None:
         server.should_exit = True
 
     backend.on_failure = end
+    if app.state.gate.open and not _is_loopback(settings.host):
+        logger.warning(
+            "NO API KEYS ARE SET and this server listens on %s: everyone who reaches it may use it and see every job. "
+            "Set STRAIGHTPCF_API_KEYS or STRAIGHTPCF_API_KEYS_FILE.",
+            settings.host,
+        )
     server.run()
     if backend.failure is not None:
         raise backend.failure
+
+
+class _Server(uvicorn.Server):
+    """Tell the engine of a signal at once: /readyz says "draining" while requests finish."""
+
+    def __init__(self, config: uvicorn.Config, engine: Engine) -> None:
+        super().__init__(config)
+        self._engine = engine
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to shut down."""
+        self._engine.drain()
+        super().handle_exit(sig, frame)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _limits(settings: Settings) -> Limits:
+    return Limits(
+        max_bytes=settings.max_bytes,
+        max_points=settings.max_points,
+        max_jobs=settings.max_jobs,
+        max_queued_points=settings.max_queued_points,
+        max_jobs_per_key=settings.max_jobs_per_key,
+        max_spool_bytes=settings.max_spool_bytes,
+        min_free_bytes=settings.min_free_bytes,
+        max_sync_seconds=settings.max_sync_seconds,
+        result_ttl_seconds=settings.result_ttl_seconds,
+        row_ttl_seconds=settings.row_ttl_seconds,
+        shutdown_seconds=settings.shutdown_seconds,
+    )
 
 
 def _local_backend(settings: Settings) -> LocalBackend:

@@ -1,159 +1,319 @@
-"""The one core behind every transport: limits, admission, running, events. Knows no HTTP."""
+"""The one core behind every transport: admission, durable jobs, running, events, results. Knows no HTTP."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
+import logging
+import re
 import uuid
-from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Concatenate, ParamSpec, TypeVar
+from weakref import WeakValueDictionary
 
-from straightpcf.points.errors import JobCanceled, ServerBusy, TooManyBytes
-from straightpcf.points.formats import format_named
+from straightpcf.points.errors import InvalidRequest, JobExpired, JobNotFinished, ServerBusy
+from straightpcf.points.formats import estimate_points, format_named
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.backends.base import Backend, FileJob, FileReport
+from straightpcf.service.admission import Limits
+from straightpcf.service.backends.base import Backend
+from straightpcf.service.jobs.folders import JobFolders, digest_of
+from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState
+from straightpcf.service.jobs.runner import JobRunner
+from straightpcf.service.jobs.store import JobStore, Load, NewJob
 
-__all__ = ["Engine", "Event", "Job", "Limits"]
+__all__ = ["Engine", "JobRequest"]
+
+# Another server may work on a job of ours, and tells us nothing: readers look again after this.
+POLL_SECONDS = 1.0
+SWEEP_SECONDS = 30.0
+CHUNK_BYTES = 2**20
+_ID = re.compile(r"(?!\.)[A-Za-z0-9._-]{1,64}")
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Bound what is taken; the fields are those of `Settings`."""
+class JobRequest:
+    """Ask for a job; an idempotency key stands for the endpoint, the options, the names and the content."""
 
-    max_bytes: int
-    max_points: int
-    max_jobs: int
-    max_wait_seconds: float
-
-    def check_bytes(self, size: int) -> None:
-        """Raise TooManyBytes above the limit."""
-        if size > self.max_bytes:
-            raise TooManyBytes(f"the body has {size} bytes or more; this server takes {self.max_bytes}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """Tell one thing that happened to a job; progress is the share that is done, 0..1."""
-
-    kind: Literal["queued", "start", "progress", "completed"]
-    progress: float = 0.0
-
-
-class Job:
-    """Hold one accepted job: its events while it runs, its report or its error at the end."""
-
-    def __init__(self, job: FileJob) -> None:
-        self.id = job.id
-        self._events: list[Event] = []
-        self._news = asyncio.Event()
-        self._task: asyncio.Task[FileReport]
-        self._publish(Event(kind="queued"))
-
-    async def result(self) -> FileReport:
-        """Wait for the end; raises StraightPCFError, JobCanceled among them. Ceasing to wait cancels nothing."""
-        await asyncio.wait([self._task])
-        if self._task.cancelled():
-            raise JobCanceled(f"job {self.id} was canceled")
-        return self._task.result()
-
-    async def cancel(self) -> None:
-        """Drop the job, whatever its state; returns once nothing works on it any more."""
-        self._task.cancel()
-        await asyncio.wait([self._task])
-
-    async def events(self) -> AsyncIterator[Event]:
-        """Yield what happened so far and what happens next, until the job ends."""
-        seen = 0
-        while True:
-            news = self._news
-            for event in self._events[seen:]:
-                seen += 1
-                yield event
-            if self._task.done() and seen == len(self._events):
-                return
-            await news.wait()
-
-    def _publish(self, event: Event) -> None:
-        self._events.append(event)
-        self._wake()
-
-    def _wake(self) -> None:
-        self._news, old = asyncio.Event(), self._news
-        old.set()
-
-    def _on_progress(self, fraction: float) -> None:
-        if fraction - self._events[-1].progress >= 0.01:  # the log of a job stays short
-            self._publish(Event(kind="progress", progress=fraction))
+    options: DenoiseOptions
+    name: str | None = None
+    format: str | None = None
+    owner: str = ""
+    id: str | None = None
+    idempotency_key: str | None = None
+    endpoint: str = "jobs"
+    traceparent: str | None = None
 
 
 class Engine:
-    """Admit jobs up to the limits and run them on a backend."""
+    """Admit jobs, keep them safe, run them on a backend, and tell what becomes of them.
 
-    def __init__(self, backend: Backend, *, limits: Limits) -> None:
+    A job is committed before `submit` returns; a server or worker that dies loses none. `owner` is a key's
+    fingerprint: the jobs of others raise NotFound.
+    """
+
+    def __init__(self, backend: Backend, *, limits: Limits, data_dir: Path) -> None:
         self.backend = backend
         self.limits = limits
-        self._jobs: set[Job] = set()
+        self.draining = False
+        self.load = Load(jobs=0, points=0, bytes=0)  # as it was a moment ago
+        self.counts: dict[str, int] = {}  # jobs by state, likewise
+        self._data_dir = data_dir
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="job-store")  # SQLite blocks, the event loop must not
+        self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
+        self._sweeper: asyncio.Task[None] | None = None
+        self._store: JobStore
+        self._folders: JobFolders
+        self._runner: JobRunner
 
     @property
     def ready(self) -> bool:
         """Tell whether a job that is submitted now finds a warm worker."""
-        return bool(self.backend.devices)
+        return bool(self.backend.devices) and not self.draining
 
     async def start(self) -> None:
-        """Begin to start the backend; `ready` tells when it is."""
+        """Open the store, take back what dead servers left, and begin to start the backend; `ready` says when it is."""
+        self._folders = await asyncio.to_thread(JobFolders, self._data_dir)
+        self._store = await asyncio.get_running_loop().run_in_executor(
+            self._thread, JobStore, self._data_dir / "jobs.sqlite3"
+        )
+        self._runner = JobRunner(
+            self.backend, folders=self._folders, call=self._call, notify=self._notify,
+            max_points=self.limits.max_points, result_ttl_seconds=self.limits.result_ttl_seconds,
+        )  # fmt: skip
+        await self._sweep()
         await self.backend.start()
+        self._runner.start()
+        self._sweeper = asyncio.create_task(self._keep_sweeping())
+
+    def drain(self) -> None:
+        """Take nothing new from now on; what runs goes on."""
+        self.draining = True
 
     async def stop(self) -> None:
-        """Cancel what still runs and end the backend."""
-        await asyncio.gather(*(job.cancel() for job in self._jobs))
+        """Let running jobs finish for a while, put the others back into the queue, and end the backend."""
+        self.drain()
+        if self._sweeper is not None:
+            self._sweeper.cancel()
+            await asyncio.wait([self._sweeper])
+        await self._runner.stop(patience_seconds=self.limits.shutdown_seconds)
         await self.backend.stop()
+        await self._call(JobStore.close)
+        self._thread.shutdown()
+        self._folders.close()
 
-    def check_room(self) -> None:
-        """Raise ServerBusy if a job would not be admitted now, the backend's failure if none ever will."""
+    # --- taking jobs
+
+    def check_room(self, *, size: int = 0) -> None:
+        """Raise what would keep a job of `size` bytes from being admitted, as far as it is known before its body."""
         if self.backend.failure is not None:
             raise self.backend.failure
-        if len(self._jobs) >= self.limits.max_jobs:
-            raise ServerBusy(f"{len(self._jobs)} jobs are waiting or running; this server holds {self.limits.max_jobs}")
+        if self.draining:
+            raise ServerBusy("the server is shutting down")
+        self.limits.check_bytes(size)
+        self.limits.check_queue(self.load)
+        self.limits.check_disk(self.load, self._folders.free_bytes(), size=size)
 
-    def submit(
-        self, source: Path, target: Path, *, options: DenoiseOptions, name: str | None = None, format: str | None = None
-    ) -> Job:
-        """Admit one file at once or raise: ServerBusy, TooManyBytes, UnknownFormat, or the backend's failure."""
-        self.check_room()
-        self.limits.check_bytes(source.stat().st_size)
-        if format is not None:
-            format_named(format)  # raises before anything waits
-        file_job = FileJob(
-            id=uuid.uuid4().hex,
-            source=source,
-            target=target,
-            options=options,
-            max_points=self.limits.max_points,
-            name=name,
-            format=format,
+    def upload(self) -> AbstractContextManager[Path]:
+        """Lend a file for a request's body; what is not submitted is removed."""
+        return self._folders.upload()
+
+    async def submit(self, source: Path, request: JobRequest) -> tuple[JobRecord, bool]:
+        """Commit one job, or find the one that the same request made; return it and whether it is new.
+
+        Raises ServerBusy, SpoolFull, QuotaExceeded, TooManyBytes, UnknownFormat, IdConflict, IdempotencyConflict.
+        """
+        size = source.stat().st_size
+        self.check_room(size=size)
+        if request.format is not None:
+            format_named(request.format)  # raises before anything waits
+        if request.id is not None and not _ID.fullmatch(request.id):
+            raise InvalidRequest(
+                f"job id is {request.id[:80]!r}; it must be 1 to 64 of A-Z a-z 0-9 . _ -, no dot first"
+            )
+        content, weight = await asyncio.to_thread(
+            lambda: (digest_of(source), estimate_points(source, name=request.name))
         )
-        job = Job(file_job)
-        self._jobs.add(job)
-        job._task = asyncio.create_task(self._run(file_job, job), name=f"job-{job.id}")
-        job._task.add_done_callback(lambda task: self._close(job, task))
-        return job
+        said = [request.endpoint, asdict(request.options), request.name, request.format, content]
+        new = NewJob(
+            id=request.id or uuid.uuid4().hex,
+            owner=request.owner,
+            folder=uuid.uuid4().hex,
+            name=request.name,
+            format=request.format,
+            options=request.options,
+            bytes=size,
+            weight=weight,
+            digest=hashlib.sha256(json.dumps(said).encode()).hexdigest(),
+            idempotency_key=request.idempotency_key,
+            traceparent=request.traceparent,
+        )
+        record, created = await self._call(self._admit, new, source)
+        if created:
+            self._notify(record.id)
+            self._runner.wake()
+        return record, created
 
-    async def _run(self, file_job: FileJob, job: Job) -> FileReport:
-        def on_start() -> None:
-            waiting.reschedule(None)
-            job._publish(Event(kind="start"))
-
+    def _admit(self, store: JobStore, new: NewJob, source: Path) -> tuple[JobRecord, bool]:
+        if (known := store.match(new)) is not None:
+            return known, False
+        self.load = store.load()
+        self.limits.check_queue(self.load, weight=new.weight)
+        self.limits.check_key(store.load(new.owner))
+        self.limits.check_disk(self.load, self._folders.free_bytes(), size=new.bytes)
+        created = False
         try:
-            async with asyncio.timeout(self.limits.max_wait_seconds) as waiting:
-                report = await self.backend.run(file_job, on_start=on_start, on_progress=job._on_progress)
-        except TimeoutError as exc:
-            raise ServerBusy(f"no worker was free within {self.limits.max_wait_seconds:g} s") from exc
-        job._publish(Event(kind="completed", progress=1.0))
-        return report
+            self._folders.adopt(source, new.folder)
+            record, created = store.create(new)
+            return record, created
+        finally:
+            if not created:  # another server was quicker, or the disk is full
+                self._folders.remove(new.folder)
 
-    def _close(self, job: Job, task: asyncio.Task[FileReport]) -> None:
-        self._jobs.discard(job)
-        if not task.cancelled():
-            task.exception()  # seen, even if nobody awaits the result
-        job._wake()
+    # --- telling about jobs
+
+    async def get(self, id: str, *, owner: str = "") -> JobRecord:
+        """Return a job as it is."""
+        return await self._call(JobStore.get, id, owner)
+
+    async def list(
+        self, *, owner: str = "", states: Collection[JobState] = (), limit: int = 50, cursor: str | None = None
+    ) -> tuple[list[JobRecord], str | None]:
+        """Return a page of jobs, newest first, and the cursor of the next."""
+        return await self._call(JobStore.page, owner=owner, states=states, limit=limit, cursor=cursor)
+
+    async def wait(self, id: str, *, owner: str = "", seconds: float | None = None) -> JobRecord:
+        """Return a job once it is finished, or as it is after `seconds`."""
+        loop = asyncio.get_running_loop()
+        until = None if seconds is None else loop.time() + seconds
+        while True:
+            news = self._news_of(id)
+            record = await self.get(id, owner=owner)
+            left = POLL_SECONDS if until is None else min(POLL_SECONDS, until - loop.time())
+            if record.finished or left <= 0:
+                return record
+            await _first(news, left)
+
+    async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncIterator[JobEvent]:
+        """Yield what happened behind event `after`, and then what happens, until `completed`."""
+        while True:
+            news = self._news_of(id)
+            record = await self.get(id, owner=owner)
+            for event in await self._call(JobStore.events, id, after):
+                after = event.seq
+                yield event
+            if record.finished:
+                return
+            await _first(news, POLL_SECONDS)
+
+    async def result(self, id: str, *, owner: str = "") -> tuple[Path, JobRecord]:
+        """Return the result file; raises JobNotFinished, JobExpired, or what the job failed with."""
+        record = await self.get(id, owner=owner)
+        if record.error is not None:
+            raise record.error
+        if record.state == "expired":
+            raise JobExpired(f"the result of job {id} has been removed")
+        if record.state != "succeeded":
+            raise JobNotFinished(f"job {id} is {record.state}, {100 * record.progress:.0f} % done")
+        return self._folders.path(record.folder) / await self._call(JobStore.result_file, id), record
+
+    async def patches(self, id: str, *, owner: str = "") -> AsyncIterator[bytes]:
+        """Yield the patch stream (docs/api.md) as it grows; a second attempt goes on where the first one ended.
+
+        That is sound because the same input, options and weights give the same bytes.
+        """
+        sent = 0
+        while True:
+            news = self._news_of(id)
+            record = await self.get(id, owner=owner)
+            path = self._folders.path(record.folder) / f"patches-{record.attempts}"
+            while chunk := await asyncio.to_thread(_read_from, path, sent):
+                sent += len(chunk)
+                yield chunk
+            if record.finished:
+                break
+            await _first(news, POLL_SECONDS)
+        if record.error is not None:
+            raise record.error
+        if sent == 0:
+            raise JobExpired(f"the patches of job {id} have been removed")
+
+    async def cancel(self, id: str, *, owner: str = "") -> JobRecord:
+        """Cancel a job; returns when nothing of this server works on it. A finished job stays as it is."""
+        await self.get(id, owner=owner)
+        await self._call(JobStore.request_cancel, id, expires_in=self.limits.result_ttl_seconds)
+        await self._runner.cancel(id)
+        self._notify(id)
+        return await self.get(id, owner=owner)
+
+    async def delete(self, id: str, *, owner: str = "") -> None:
+        """Cancel a job if it is not finished, and remove its files and all that is known of it."""
+        record = await self.cancel(id, owner=owner)
+        await self._call(JobStore.delete, id)
+        await asyncio.to_thread(self._folders.remove, record.folder)
+        self._notify(id)
+
+    # --- inside
+
+    async def _call(self, function: Callable[Concatenate[JobStore, _P], _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        """Run one store transaction on the store's thread; it is carried out even if the caller is cancelled."""
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._thread, lambda: function(self._store, *args, **kwargs))
+
+    def _news_of(self, id: str) -> asyncio.Event:
+        """Return an event that is set at the next change; take it before looking, so that no change is missed."""
+        news = self._news.get(id)
+        if news is None:
+            self._news[id] = news = asyncio.Event()
+        return news
+
+    def _notify(self, id: str) -> None:
+        if (news := self._news.pop(id, None)) is not None:
+            news.set()
+
+    async def _keep_sweeping(self) -> None:
+        while True:
+            await asyncio.sleep(SWEEP_SECONDS)
+            try:
+                await self._sweep()
+            except Exception:
+                logger.exception("a sweep of the job store failed; another follows")
+
+    async def _sweep(self) -> None:
+        """Take back what died, expire what is old, remove what nobody owns."""
+        servers = await self._call(JobStore.servers)
+        dead = await asyncio.to_thread(self._folders.dead_servers, servers - {self._folders.server})
+        for id in await self._call(JobStore.recover, dead):
+            logger.warning("job %s was left by a server that died; it is queued again", id)
+            self._notify(id)
+        gone = await self._call(JobStore.expire, rows_after=self.limits.row_ttl_seconds)
+        gone += await self._call(JobStore.unknown, await asyncio.to_thread(self._folders.orphans))
+        for folder in gone:
+            await asyncio.to_thread(self._folders.remove, folder)
+        self.load, self.counts = await self._call(JobStore.load), await self._call(JobStore.counts)
+
+
+async def _first(news: asyncio.Event, seconds: float) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await news.wait()
+    except TimeoutError:
+        pass
+
+
+def _read_from(path: Path, offset: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(CHUNK_BYTES)
+    except FileNotFoundError:
+        return b""

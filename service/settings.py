@@ -13,6 +13,10 @@ from straightpcf.points.errors import InvalidOptions
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
 ENVIRONMENT_PREFIX = "STRAIGHTPCF_"
+_POSITIVE = (
+    "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
+    "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
+)  # fmt: skip
 
 
 def _default_data_dir() -> Path:
@@ -24,8 +28,13 @@ class Settings:
     """Configure one server; each field is STRAIGHTPCF_<NAME> in the environment.
 
     max_bytes: of one request body.  max_points: of one cloud.
-    max_jobs: accepted at once, waiting and running; more are answered "busy".
-    max_wait_seconds: from acceptance until a worker takes the job; longer is answered "busy".
+    max_jobs, max_queued_points: waiting and running at once, over all keys; more are answered "busy".
+    max_jobs_per_key: waiting and running for one key.  rate_per_minute: requests of one key, 0 for any number.
+    max_spool_bytes: inputs and results on the disk.  min_free_bytes: what the disk must have left.
+    max_sync_seconds: how long POST /denoise waits before it answers 202.
+    result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
+    api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
+    cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda".  weights: None for the shipped ones.  threads: None for torch's own choice.
     shutdown_seconds: how long running requests may finish after SIGTERM.
     """
@@ -35,8 +44,18 @@ class Settings:
     data_dir: Path = field(default_factory=_default_data_dir)
     max_bytes: int = 512 * 2**20
     max_points: int = 5_000_000
-    max_jobs: int = 32
-    max_wait_seconds: float = 300.0
+    max_jobs: int = 1000
+    max_queued_points: int = 200_000_000
+    max_jobs_per_key: int = 1000
+    rate_per_minute: int = 0
+    max_spool_bytes: int = 50 * 2**30
+    min_free_bytes: int = 256 * 2**20
+    max_sync_seconds: float = 300.0
+    result_ttl_seconds: float = 3600.0
+    row_ttl_seconds: float = 86400.0
+    api_keys: str = ""
+    api_keys_file: Path | None = None
+    cors_origins: str = ""
     device: str = "auto"
     weights: Path | None = None
     threads: int | None = None
@@ -44,12 +63,28 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse limits that would admit nothing."""
-        for name in ("max_bytes", "max_points", "max_jobs", "max_wait_seconds", "threads", "shutdown_seconds"):
+        for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise InvalidOptions(f"{name} is {value}; it must be above 0")
+        for name in ("rate_per_minute", "min_free_bytes", "row_ttl_seconds"):
+            if getattr(self, name) < 0:
+                raise InvalidOptions(f"{name} is {getattr(self, name)}; it must not be negative")
         if not 0 <= self.port < 2**16:
             raise InvalidOptions(f"port is {self.port}; it must be in 0..65535 (0: any free one)")
+
+    def keys(self) -> tuple[str, ...]:
+        """Return the API keys; raises InvalidOptions where their file cannot be read or holds none."""
+        keys = [key.strip() for key in self.api_keys.split(",")]
+        if self.api_keys_file is not None:
+            try:
+                keys += [line.strip() for line in self.api_keys_file.read_text().splitlines()]
+            except (OSError, UnicodeDecodeError) as exc:
+                raise InvalidOptions(f"api_keys_file {self.api_keys_file}: {exc}") from exc
+        found = tuple(dict.fromkeys(key for key in keys if key and not key.startswith("#")))
+        if self.api_keys_file is not None and not found:
+            raise InvalidOptions(f"api_keys_file {self.api_keys_file} holds no key")
+        return found
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str], **overrides: Any) -> Settings:

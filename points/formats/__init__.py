@@ -6,6 +6,7 @@ A new format is one file with a `Format` and one line in FORMATS; the contract t
 from __future__ import annotations
 
 import errno
+import struct
 from pathlib import Path, PurePath
 
 from straightpcf.points.cloud import PointCloud
@@ -23,6 +24,7 @@ __all__ = [
     "DEFAULT_MAX_POINTS",
     "FORMATS",
     "Format",
+    "estimate_points",
     "format_for",
     "format_named",
     "read_cloud",
@@ -30,6 +32,17 @@ __all__ = [
 ]
 
 FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Kitti())
+
+
+def estimate_points(path: Path, *, name: str | None = None) -> int:
+    """Guess how many points a file holds without reading it; never more than its bytes could be."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    size = path.stat().st_size
+    try:
+        return min(_recognised(head, name or path.name).estimate(head, size), size)
+    except (StraightPCFError, ValueError, struct.error):
+        return size // 16  # reading it will say what is wrong
 
 
 def read_cloud(

@@ -31,6 +31,10 @@ class Format(ABC):
     def sniff(self, head: bytes) -> bool:
         """Tell whether a file that begins with `head` (up to 4 KiB) is of this format; False if it has no magic."""
 
+    def estimate(self, head: bytes, size: int) -> int:
+        """Guess the points of a file of `size` bytes that begins with `head`: for admission, before it is read."""
+        return size // 16
+
     @abstractmethod
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read a file; raises MalformedFile, UnsupportedCloud, TooManyPoints, the last before memory is taken."""

@@ -39,6 +39,11 @@ class Las(Format):
     media_type = "application/vnd.las"
     is_compressed = False
 
+    def estimate(self, head: bytes, size: int) -> int:
+        """Read the header's count; packed points take few bytes."""
+        (legacy,) = struct.unpack_from("<I", head, 107)
+        return int(legacy or struct.unpack_from("<Q", head, 247)[0]) if len(head) >= 255 else size // 4
+
     def sniff(self, head: bytes) -> bool:
         """Recognise the signature, and by the point format's highest bit whether the points are packed."""
         return head.startswith(b"LASF") and (len(head) > 104 and head[104] >= 0x80) == self.is_compressed

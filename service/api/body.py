@@ -12,9 +12,9 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
 from straightpcf.points.errors import InvalidRequest
-from straightpcf.service.engine import Limits
+from straightpcf.service.admission import Limits
 
-__all__ = ["Upload", "check_declared_size", "receive_upload"]
+__all__ = ["Upload", "declared_size", "receive_upload"]
 
 FILE_FIELD = "file"
 MAX_FIELDS = 20
@@ -30,10 +30,10 @@ class Upload:
     fields: dict[str, str] = field(default_factory=dict)
 
 
-def check_declared_size(request: Request, limits: Limits) -> None:
-    """Refuse a body by its Content-Length, before a byte of it is read."""
-    if (declared := request.headers.get("content-length", "")).isdigit():
-        limits.check_bytes(int(declared))
+def declared_size(request: Request) -> int:
+    """Return a body's Content-Length, by which it can be refused before a byte of it is read; 0 if unknown."""
+    declared = request.headers.get("content-length", "")
+    return int(declared) if declared.isascii() and declared.isdigit() else 0
 
 
 async def receive_upload(request: Request, target: Path, *, limits: Limits) -> Upload:

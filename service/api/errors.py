@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError
+from straightpcf.points.errors import InternalError, InvalidRequest, MethodNotAllowed, NotFound, StraightPCFError
 from straightpcf.service.api.request_id import HEADER, request_id
 from straightpcf.service.api.schemas import Problem
 
@@ -52,6 +52,9 @@ STATUS_BY_CODE: Mapping[str, int] = {
 }
 
 
+_KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
+
+
 def install_error_handlers(app: FastAPI) -> None:
     """Answer every exception of an app, whoever raised it, with a problem."""
     app.add_exception_handler(StraightPCFError, _ours)
@@ -69,7 +72,7 @@ async def _ours(request: Request, error: Exception) -> Response:
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     path = f"{request.method} {request.url.path[:200]}"
-    kind = InvalidRequest if error.status_code < 500 else InternalError
+    kind = _KINDS.get(error.status_code, InvalidRequest if error.status_code < 500 else InternalError)
     return _problem(request, kind(f"{error.detail}: {path}"), error.status_code, headers=error.headers)
 
 
@@ -101,6 +104,8 @@ def _problem(
         request_id=request_id(request),
     )
     own = {HEADER: request_id(request)} | ({"Retry-After": str(RETRY_AFTER_SECONDS)} if error.retryable else {})
+    if status == 401:
+        own["WWW-Authenticate"] = "Bearer"
     return JSONResponse(
         problem.model_dump(), status_code=status, media_type=PROBLEM_MEDIA_TYPE, headers={**(headers or {}), **own}
     )

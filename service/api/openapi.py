@@ -8,7 +8,20 @@ from straightpcf.points.formats import FORMATS
 from straightpcf.points.options import MAX_ITERATIONS
 from straightpcf.service.api.schemas import Problem
 
-__all__ = ["DENOISE_BODY", "DENOISE_FORM_BODY", "DENOISE_RESPONSES", "PATH_PARAMETER", "QUERY_PARAMETERS"]
+__all__ = [
+    "DENOISE_BODY",
+    "DENOISE_FORM_BODY",
+    "DENOISE_PARAMETERS",
+    "DENOISE_RESPONSES",
+    "EVENTS_RESPONSES",
+    "JOB_BODY",
+    "JOB_RESPONSES",
+    "PATH_PARAMETER",
+    "QUERY_PARAMETERS",
+    "RESULT_RESPONSES",
+    "STREAM_RESPONSES",
+    "problems",
+]
 
 _FORMAT_NAMES = [format.name for format in FORMATS]
 
@@ -58,6 +71,17 @@ QUERY_PARAMETERS: list[dict[str, Any]] = [
     for name, schema in _OPTIONS.items()
 ]
 
+_REPORT: dict[str, Any] = {
+    "description": "Send multipart/mixed: the report as JSON, then the cloud.",
+    "type": "boolean",
+    "default": False,
+}
+
+DENOISE_PARAMETERS: list[dict[str, Any]] = [
+    *QUERY_PARAMETERS,
+    {"name": "report", "in": "query", "required": False, "schema": _REPORT},
+]
+
 PATH_PARAMETER: dict[str, Any] = {
     "name": "filename",
     "in": "path",
@@ -75,21 +99,27 @@ DENOISE_BODY: dict[str, Any] = {
     "content": {"application/octet-stream": _RAW},
 }
 
-DENOISE_FORM_BODY: dict[str, Any] = {
-    "required": True,
-    "description": "A form with the cloud in `file`, or the cloud itself.",
-    "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["file"],
-                "properties": {"file": {"type": "string", "format": "binary"}, **_OPTIONS},
+
+def _form_body(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "required": True,
+        "description": "A form with the cloud in `file`, or the cloud itself.",
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {"file": {"type": "string", "format": "binary"}, **fields},
+                },
+                "example": {"file": "@scan.ply", "iterations": "auto", "seed": 0, "strength": 1.0, "format": "ply"},
             },
-            "example": {"file": "@scan.ply", "iterations": "auto", "seed": 0, "strength": 1.0, "format": "ply"},
+            "application/octet-stream": _RAW,
         },
-        "application/octet-stream": _RAW,
-    },
-}
+    }
+
+
+JOB_BODY = _form_body(_OPTIONS)
+DENOISE_FORM_BODY = _form_body({**_OPTIONS, "report": _REPORT})
 
 _RESULT_HEADERS = {
     "X-Request-Id": ("The id of this request, also in every problem.", "string", "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"),
@@ -109,6 +139,34 @@ def _problem(description: str) -> dict[str, Any]:
     }
 
 
+_PROBLEMS = {
+    400: "The request itself is broken (`invalid_request`).",
+    401: "No API key, or an unknown one (`unauthorized`).",
+    404: "There is no such job, or not for this key (`not_found`).",
+    409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
+    410: "Its files have been removed (`job_expired`).",
+    413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
+    415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
+    416: "No byte of the result is in the range (`range_not_satisfiable`).",
+    422: "An option, a key or the cloud is unusable (`invalid_options`, `malformed_file`, `too_few_points`, "
+    "`invalid_cloud`, `unsupported_cloud`, `idempotency_conflict`).",
+    429: "This key has too many requests or jobs (`rate_limited`, `quota_exceeded`); see Retry-After.",
+    500: "A fault of the server (`internal_error`).",
+    503: "Try again after Retry-After (`server_busy`), or no device (`device_unavailable`).",
+    507: "The server's disk is full (`spool_full`).",
+}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Describe problems by status."""
+    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 422, 429})}
+
+
+_INTAKE = (400, 401, 409, 413, 415, 422, 429, 500, 503, 507)
+_JOB: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
+_LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type": "string"}}}
+
+
 DENOISE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The cloud, in the requested format.",
@@ -118,13 +176,42 @@ DENOISE_RESPONSES: dict[int | str, dict[str, Any]] = {
             for name, (description, kind, example) in _RESULT_HEADERS.items()
         },
     },
-    400: _problem("The request itself is broken (`invalid_request`)."),
-    413: _problem("Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`)."),
-    415: _problem("No format recognises the file (`unknown_format`, `missing_dependency`)."),
-    422: _problem(
-        "An option or the cloud is unusable "
-        "(`invalid_options`, `malformed_file`, `too_few_points`, `invalid_cloud`, `unsupported_cloud`)."
-    ),
-    500: {"model": Problem, **_problem("A fault of the server (`internal_error`).")},
-    503: _problem("Try again after Retry-After (`server_busy`), or no device (`device_unavailable`)."),
+    202: {
+        "description": "The job, if it was preferred so or took longer than this server lets a request wait.",
+        "content": _JOB,
+        "headers": _LOCATION,
+    },
+    **problems(*_INTAKE, 410),
+}
+
+JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The same request made it before.", "content": _JOB, "headers": _LOCATION},
+    202: {"description": "It waits for a worker.", "headers": _LOCATION},
+    **problems(*_INTAKE),
+}
+
+RESULT_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The cloud.", "content": {"application/octet-stream": _RAW}},
+    206: {"description": "The part that was asked for.", "content": {"application/octet-stream": _RAW}},
+    304: {"description": "What If-None-Match names is still the result."},
+    **problems(400, 401, 404, 409, 410, 413, 415, 416, 500),
+}
+
+EVENTS_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Events `queued start progress preview output log completed`; docs/api.md says what is in each.",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    },
+    **problems(400, 401, 404),
+}
+
+STREAM_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Finished patches, framed as in docs/api.md.",
+        "content": {
+            "application/vnd.straightpcf.patches": _RAW,
+            "application/x-ndjson": {"schema": {"type": "string"}},
+        },
+    },
+    **problems(400, 401, 404, 409, 410, 413, 415, 500),
 }

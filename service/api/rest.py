@@ -1,117 +1,131 @@
-"""The REST API: parse a request, hand it to the engine, send the file."""
+"""POST /denoise and what tells about the server: parse a request, hand it to the engine, send the file."""
 
 from __future__ import annotations
 
 import asyncio
-import math
-from collections.abc import Mapping
-from contextlib import ExitStack
-from pathlib import PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Annotated
 
-from fastapi import APIRouter, Request
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import JSONResponse, Response
+from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect
-from starlette.types import Receive, Scope, Send
 
 import straightpcf
-from straightpcf.points.errors import InvalidOptions
-from straightpcf.points.formats import FORMATS, format_named
-from straightpcf.points.options import MAX_ITERATIONS, DenoiseOptions
-from straightpcf.service.api.body import check_declared_size, receive_upload
+from straightpcf.points.formats import FORMATS
+from straightpcf.points.options import MAX_ITERATIONS
+from straightpcf.service.api.auth import owner_of
+from straightpcf.service.api.download import report_and_file, result_response
+from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
+from straightpcf.service.api.intake import flag, take_job
+from straightpcf.service.api.jobs import job_response
 from straightpcf.service.api.openapi import (
     DENOISE_BODY,
     DENOISE_FORM_BODY,
+    DENOISE_PARAMETERS,
     DENOISE_RESPONSES,
     PATH_PARAMETER,
-    QUERY_PARAMETERS,
 )
+from straightpcf.service.api.prefer import parse_prefer
 from straightpcf.service.api.schemas import FormatInfo, Health, Info
-from straightpcf.service.backends.base import FileReport
-from straightpcf.service.engine import Engine, Job
+from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.record import JobRecord
 
 __all__ = ["router"]
 
-OPTION_FIELDS = frozenset({"iterations", "seed", "strength"})
-KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
-MAX_NAME_LENGTH = 120
-
 router = APIRouter()
+Owner = Annotated[str, Depends(owner_of)]
 
 
 @router.post(
     "/denoise",
     summary="Denoise one point cloud",
-    response_class=FileResponse,
+    response_class=Response,
     responses=DENOISE_RESPONSES,
-    openapi_extra={"requestBody": DENOISE_FORM_BODY, "parameters": QUERY_PARAMETERS},
+    openapi_extra={"requestBody": DENOISE_FORM_BODY, "parameters": DENOISE_PARAMETERS},
 )
-@router.post("/denoise/{filename}", include_in_schema=False, response_class=FileResponse)
-@router.put("/denoise", include_in_schema=False, response_class=FileResponse)
+@router.post("/denoise/{filename}", include_in_schema=False, response_class=Response)
+@router.put("/denoise", include_in_schema=False, response_class=Response)
 @router.put(
     "/denoise/{filename}",
     summary="Denoise one point cloud (what `curl -T scan.ply URL/denoise/` sends)",
-    response_class=FileResponse,
+    response_class=Response,
     responses=DENOISE_RESPONSES,
-    openapi_extra={"requestBody": DENOISE_BODY, "parameters": [PATH_PARAMETER, *QUERY_PARAMETERS]},
+    openapi_extra={"requestBody": DENOISE_BODY, "parameters": [PATH_PARAMETER, *DENOISE_PARAMETERS]},
     operation_id="denoise_put",
 )
-async def denoise(request: Request) -> FileResponse:
+async def denoise(request: Request, owner: Owner) -> Response:
     """Take a noisy cloud and give back the same points, in the same order, on the surface.
 
     Send a form with the cloud in the field `file`, or the cloud itself as the body and the options in the query
-    string. Every field of the file but the positions comes back unchanged.
+    string. Every field of the file but the positions comes back unchanged. The request waits for the result; with
+    `Prefer: respond-async` or after `Prefer: wait=N` it answers 202 and the job, and with `Accept: text/event-stream`
+    the events of the job.
     """
     engine: Engine = request.app.state.engine
-    engine.check_room()
-    check_declared_size(request, engine.limits)
-    _parse_fields(request.query_params)
-    with ExitStack() as cleanup:
-        folder = cleanup.enter_context(request.app.state.spool.folder())
-        source, target = folder / "input", folder / "output"
-        upload = await receive_upload(request, source, limits=engine.limits)
-        fields = {**request.query_params, **upload.fields}
-        options, format = _parse_fields(fields)
-        name = _file_name(fields.get("filename") or request.path_params.get("filename") or upload.name)
-        job = engine.submit(source, target, options=options, name=name, format=format)
-        report = await _result_while_connected(job, request)
-        return _SpooledFileResponse(
-            target,
-            cleanup=cleanup.pop_all(),
-            filename=_result_name(name, report.format),
-            media_type=format_named(report.format).media_type,
-            headers=_report_headers(report),
-        )
+    prefer = parse_prefer(request.headers.getlist("prefer"))
+    record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
+    if SSE_MEDIA_TYPE in request.headers.get("accept", ""):
+        return event_stream(engine, record.id, owner, headers={"Location": f"/jobs/{record.id}"})
+    if prefer.respond_async:
+        return job_response(record, 202, prefer.applied())
+    # Nobody else knows the id of such a job: it lives as long as its request.
+    private = not prefer.stated and "idempotency-key" not in request.headers
+    longest = (
+        engine.limits.max_sync_seconds if prefer.wait is None else min(prefer.wait, engine.limits.max_sync_seconds)
+    )
+    try:
+        record = await _wait_while_connected(engine, request, record, longest)
+    except ClientDisconnect:
+        if private:
+            await engine.delete(record.id, owner=owner)
+        raise
+    if not record.finished:
+        return job_response(record, 202, prefer.applied())
+    cleanup = BackgroundTask(engine.delete, record.id, owner=owner) if private else None
+    try:
+        path, record = await engine.result(record.id, owner=owner)
+        if flag(fields, "report"):
+            return report_and_file(path, record, after=cleanup)
+        return result_response(request, path, record, after=cleanup)
+    except Exception:
+        if private:
+            await engine.delete(record.id, owner=owner)
+        raise
 
 
 @router.get("/healthz", summary="Is the server there")
-@router.get("/livez", include_in_schema=False)
+@router.get("/livez", summary="Is the server there", operation_id="livez")
 async def health(request: Request) -> Health:
     """Answer as long as the process lives, however busy the workers are."""
     return Health(status="ok", ready=request.app.state.engine.ready)
 
 
-@router.get("/readyz", summary="Is a worker warm", responses={503: {"model": Health}})
+@router.get("/readyz", summary="Is a worker warm", response_model=Health, responses={503: {"model": Health}})
 async def ready(request: Request) -> JSONResponse:
-    """Answer 200 once the weights are loaded and a first cloud went through them, 503 before."""
-    is_ready = request.app.state.engine.ready
-    health = Health(status="ok" if is_ready else "starting", ready=is_ready)
-    return JSONResponse(health.model_dump(), status_code=200 if is_ready else 503)
+    """Answer 200 once the weights are loaded and a first cloud went through them, 503 before and while draining."""
+    engine: Engine = request.app.state.engine
+    status = "ok" if engine.ready else "draining" if engine.draining else "starting"
+    health = Health(status=status, ready=engine.ready)
+    return JSONResponse(health.model_dump(), status_code=200 if engine.ready else 503)
 
 
 @router.get("/v1/info", summary="Version, limits, formats, devices")
-async def info(request: Request) -> Info:
+async def info(request: Request, owner: Owner) -> Info:
     """Say what this server is and takes."""
     engine: Engine = request.app.state.engine
+    limits = engine.limits
     return Info(
         version=straightpcf.__version__,
         model="StraightPCF",
         weights=request.app.state.weights,
         devices=list(engine.backend.devices),
-        max_bytes=engine.limits.max_bytes,
-        max_points=engine.limits.max_points,
-        max_jobs=engine.limits.max_jobs,
+        max_bytes=limits.max_bytes,
+        max_points=limits.max_points,
+        max_jobs=limits.max_jobs,
+        max_queued_points=limits.max_queued_points,
         max_iterations=MAX_ITERATIONS,
+        max_sync_seconds=limits.max_sync_seconds,
+        result_ttl_seconds=limits.result_ttl_seconds,
         formats=[
             FormatInfo(name=format.name, suffixes=list(format.suffixes), media_type=format.media_type)
             for format in FORMATS
@@ -119,21 +133,9 @@ async def info(request: Request) -> Info:
     )
 
 
-class _SpooledFileResponse(FileResponse):
-    """Send a file and let go of its folder, also if the client breaks off."""
-
-    def __init__(self, path: Any, *, cleanup: ExitStack, **options: Any) -> None:
-        super().__init__(path, **options)
-        self._cleanup = cleanup
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        with self._cleanup:
-            await super().__call__(scope, receive, send)
-
-
-async def _result_while_connected(job: Job, request: Request) -> FileReport:
-    """Wait for the job; a client that goes away cancels it, and so does a server that shuts down."""
-    result = asyncio.ensure_future(job.result())
+async def _wait_while_connected(engine: Engine, request: Request, record: JobRecord, seconds: float) -> JobRecord:
+    """Wait for the job's end; raises ClientDisconnect when there is nobody left to send it to."""
+    result = asyncio.ensure_future(engine.wait(record.id, owner=record.owner, seconds=seconds))
     gone = asyncio.ensure_future(_disconnected(request))
     try:
         await asyncio.wait([result, gone], return_when=asyncio.FIRST_COMPLETED)
@@ -143,46 +145,8 @@ async def _result_while_connected(job: Job, request: Request) -> FileReport:
     finally:
         gone.cancel()
         result.cancel()
-        await job.cancel()  # before the folder goes; nothing to do for a job that has ended
 
 
 async def _disconnected(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
-
-
-def _parse_fields(fields: Mapping[str, str]) -> tuple[DenoiseOptions, str | None]:
-    if unknown := set(fields) - KNOWN_FIELDS:
-        raise InvalidOptions(f"{min(unknown)[:40]!r} is no option; known: {', '.join(sorted(KNOWN_FIELDS))}")
-    options = DenoiseOptions.parse(**{name: fields[name] for name in OPTION_FIELDS & set(fields)})
-    if format := fields.get("format"):
-        format_named(format)
-    return options, format or None
-
-
-def _file_name(name: str | None) -> str | None:
-    """Keep the last part of what the client calls the file; it names a format and a download, never a path here."""
-    if name is None:
-        return None
-    last = PurePosixPath(PureWindowsPath(name).name).name
-    return "".join(char for char in last if char.isprintable())[-MAX_NAME_LENGTH:] or None
-
-
-def _result_name(name: str | None, format: str) -> str:
-    stem = PurePosixPath(name).stem if name else "cloud"
-    suffixes = format_named(format).suffixes
-    own = PurePosixPath(name).suffix.lower() if name else ""
-    return f"{stem}_clean{own if own in suffixes else suffixes[0]}"
-
-
-def _report_headers(report: FileReport) -> dict[str, str]:
-    def number(value: float) -> str:
-        return repr(value) if math.isfinite(value) else "nan"
-
-    return {
-        "X-Points": str(report.points),
-        "X-Iterations": str(report.iterations),
-        "X-Noise-Before": number(report.noise_before),
-        "X-Noise-After": number(report.noise_after),
-        "X-Untouched": str(report.untouched),
-    }

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
-__all__ = ["FormatInfo", "Health", "Info", "Problem"]
+from pydantic import BaseModel, ConfigDict, PlainSerializer
+
+from straightpcf.service.jobs.record import JobRecord, JobState
+
+__all__ = ["FormatInfo", "Health", "Info", "Job", "JobPage", "Problem", "Report"]
+
+_ID = "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"
+
+
+def _rfc3339(at: datetime) -> str:
+    return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+Time = Annotated[datetime, PlainSerializer(_rfc3339, return_type=str)]
 
 
 class Problem(BaseModel):
@@ -27,10 +41,163 @@ class Problem(BaseModel):
                 "detail": "the header promises 100 vertices, the file ends after 42",
                 "code": "malformed_file",
                 "retryable": False,
-                "request_id": "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1",
+                "request_id": _ID,
             }
         }
     )
+
+
+class JobOptions(BaseModel):
+    """Say what was asked for."""
+
+    iterations: int | Literal["auto"]
+    seed: int
+    strength: float
+
+
+class JobError(BaseModel):
+    """Say why a job failed."""
+
+    code: str
+    detail: str
+    retryable: bool
+
+
+class JobResult(BaseModel):
+    """Describe the result file; sha256 in hex."""
+
+    bytes: int
+    sha256: str
+    media_type: str
+    filename: str
+    format: str
+
+
+class Displacement(BaseModel):
+    """Say how far the points moved, in the cloud's unit."""
+
+    p50: float
+    p90: float
+    p99: float
+    max: float
+    mean: float
+
+
+class Timings(BaseModel):
+    """Say where the time went, in seconds."""
+
+    read: float
+    filter: float
+    write: float
+
+
+class Report(BaseModel):
+    """Say what was done to a cloud; noise in its own unit, null where it is unknown."""
+
+    format: str
+    points: int
+    untouched: int
+    iterations: int
+    noise_before: float | None
+    noise_after: float | None
+    distances: list[float]
+    displacement: Displacement
+    seconds: float
+    timings: Timings
+    device: str
+    warnings: list[str]
+
+
+class Links(BaseModel):
+    """Name where a job's parts are."""
+
+    self: str
+    events: str
+    result: str
+    stream: str
+    report: str
+    cancel: str
+
+
+class Job(BaseModel):
+    """Show one job."""
+
+    id: str
+    state: JobState
+    name: str | None
+    format: str | None
+    options: JobOptions
+    bytes: int
+    points: int | None
+    progress: float
+    attempts: int
+    position: int | None
+    created_at: Time
+    started_at: Time | None
+    finished_at: Time | None
+    expires_at: Time | None
+    error: JobError | None
+    result: JobResult | None
+    report: Report | None
+    links: Links
+
+    @classmethod
+    def of(cls, record: JobRecord) -> Job:
+        """Render a job of the store."""
+        at = f"/jobs/{record.id}"
+        plain = ("id", "state", "name", "format", "bytes", "points", "progress", "attempts", "position", "created_at",
+                 "started_at", "finished_at", "expires_at")  # fmt: skip
+        error, result = record.error, record.result
+        return cls(
+            **{name: getattr(record, name) for name in plain},
+            options=JobOptions.model_validate(record.options, from_attributes=True),
+            error=None if error is None else JobError(code=error.code, detail=error.message, retryable=error.retryable),
+            result=None if result is None else JobResult.model_validate(result, from_attributes=True),
+            report=None if record.report is None else Report.model_validate(record.report),
+            links=Links(
+                self=at, events=f"{at}/events", result=f"{at}/result", stream=f"{at}/stream", report=f"{at}/report",
+                cancel=f"{at}/cancel",
+            ),
+        )  # fmt: skip
+
+    def plain(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        return self.model_dump(mode="json")
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "id": _ID,
+                "state": "processing",
+                "name": "scan.ply",
+                "format": None,
+                "options": {"iterations": "auto", "seed": 0, "strength": 1.0},
+                "bytes": 600_212,
+                "points": None,
+                "progress": 0.42,
+                "attempts": 1,
+                "position": None,
+                "created_at": "2026-11-21T12:00:00.000Z",
+                "started_at": "2026-11-21T12:00:00.120Z",
+                "finished_at": None,
+                "expires_at": None,
+                "error": None,
+                "result": None,
+                "report": None,
+                "links": {
+                    part: f"/jobs/{_ID}" + ("" if part == "self" else f"/{part}")
+                    for part in ("self", "events", "result", "stream", "report", "cancel")
+                },
+            }
+        }
+    )
+
+
+class JobPage(BaseModel):
+    """Show some jobs, newest first; next_cursor asks for those behind them, null at the end."""
+
+    jobs: list[Job]
+    next_cursor: str | None
 
 
 class Health(BaseModel):
@@ -60,5 +227,8 @@ class Info(BaseModel):
     max_bytes: int
     max_points: int
     max_jobs: int
+    max_queued_points: int
     max_iterations: int
+    max_sync_seconds: float
+    result_ttl_seconds: float
     formats: list[FormatInfo]

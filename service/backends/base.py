@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,7 +10,7 @@ from typing import Protocol
 from straightpcf.points.errors import StraightPCFError
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["Backend", "FileJob", "FileReport"]
+__all__ = ["Backend", "FileJob", "FileReport", "Listener", "WorkerDied"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +19,7 @@ class FileJob:
 
     name: the file name the user gave, None to recognise the format from the content.
     format: the name of the output format, None for that of the input.
+    patches: where finished patches go, as the patch stream of docs/api.md; None for nowhere.
     """
 
     id: str
@@ -28,11 +29,18 @@ class FileJob:
     max_points: int
     name: str | None = None
     format: str | None = None
+    patches: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileReport:
-    """Tell what was done; noise_before and noise_after are in the cloud's own unit."""
+    """Tell what was done.
+
+    noise_before, noise_after: estimated std in the cloud's own unit, NaN if unknown. distances: the DistanceModule's
+    median before each pass and after the last. displacement: "p50", "p90", "p99", "max", "mean" of how far the
+    points moved, in the cloud's unit. seconds: in all; timings: "read", "filter", "write". bytes, sha256: of the
+    target file.
+    """
 
     format: str
     points: int
@@ -40,8 +48,31 @@ class FileReport:
     iterations: int
     noise_before: float
     noise_after: float
+    distances: tuple[float, ...]
+    displacement: Mapping[str, float]
     seconds: float
+    timings: Mapping[str, float]
+    device: str
+    bytes: int
+    sha256: str
     warnings: tuple[str, ...] = ()
+
+
+class WorkerDied(Exception):  # noqa: N818 - an event, never shown to a user
+    """Report a worker that ended without an answer (killed, out of memory, a crash in native code)."""
+
+
+class Listener(Protocol):
+    """Hear of one job while it runs; called on the event loop, must not block."""
+
+    def on_start(self, device: str) -> None:
+        """A worker has the job."""
+
+    def on_progress(self, fraction: float, iteration: int) -> None:
+        """The share that is done, 0..1, in pass `iteration` (0: reading)."""
+
+    def on_preview(self, iteration: int, indices: list[int], xyz: list[list[float]]) -> None:
+        """Where a few points are after a pass."""
 
 
 class Backend(Protocol):
@@ -55,6 +86,14 @@ class Backend(Protocol):
         """Name the devices that have finished a warm-up and take jobs."""
 
     @property
+    def slots(self) -> int:
+        """Say how many jobs run at once when every worker is warm."""
+
+    @property
+    def restarts(self) -> int:
+        """Count the workers that died and were replaced."""
+
+    @property
     def failure(self) -> StraightPCFError | None:
         """Say why no job will ever run here."""
 
@@ -64,10 +103,11 @@ class Backend(Protocol):
     async def stop(self) -> None:
         """End every worker."""
 
-    async def run(
-        self, job: FileJob, *, on_start: Callable[[], None], on_progress: Callable[[float], None]
-    ) -> FileReport:
-        """Wait for a worker and run the job; raises StraightPCFError.
+    async def wait_idle(self) -> None:
+        """Return as soon as a worker is warm and free; raises `failure`."""
 
-        Cancelling the awaiting task cancels the work; the call returns once the worker has let go.
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
+        """Wait for a worker and run the job once; raises StraightPCFError, WorkerDied.
+
+        Cancelling the awaiting task cancels the work; the call returns within a second, when nothing works on it.
         """

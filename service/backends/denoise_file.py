@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
 
 from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from straightpcf.points.wire.patches import encode_end, encode_frame, encode_header
 from straightpcf.service.backends.base import FileJob, FileReport
 
 if TYPE_CHECKING:
@@ -13,15 +22,48 @@ if TYPE_CHECKING:
 
 __all__ = ["denoise_file"]
 
+PREVIEW_POINTS = 256
 
-def denoise_file(denoiser: Filter, job: FileJob, *, on_progress: Callable[[float], None] | None = None) -> FileReport:
-    """Read, denoise and write; raises StraightPCFError, and whatever on_progress raises to stop the work."""
+OnProgress = Callable[[float, int], None]
+OnPreview = Callable[[int, list[int], list[list[float]]], None]
+
+
+def denoise_file(
+    denoiser: Filter, job: FileJob, *, on_progress: OnProgress | None = None, on_preview: OnPreview | None = None
+) -> FileReport:
+    """Read, denoise and write; raises StraightPCFError, and whatever on_progress raises to stop the work.
+
+    The target is on the disk, not only in its cache, when this returns.
+    """
+    from straightpcf.model.filter import Run
+
+    began = time.monotonic()
     cloud, source_format = read_cloud(job.source, name=job.name, max_points=job.max_points)
     target_format = source_format if job.format is None else format_named(job.format)
     if on_progress is not None:
-        on_progress(0.0)
-    result = denoiser.denoise(cloud.xyz, job.options, on_progress=on_progress)
+        on_progress(0.0, 0)
+    was_read = time.monotonic()
+    run = Run(denoiser, cloud.xyz, job.options)
+    with ExitStack() as open_files:
+        patches = None if job.patches is None else open_files.enter_context(_PatchFile(job.patches, len(cloud)))
+        preview = _Preview(len(cloud), on_preview)
+        for patch in run.patches():
+            if patches is not None:
+                patches.write(
+                    encode_frame(patch.indices, patch.xyz, iteration=patch.iteration, final=patch.final,
+                                 progress=patch.progress)
+                )  # fmt: skip
+            preview.add(patch.iteration, patch.indices, patch.xyz)
+            if on_progress is not None:
+                on_progress(patch.progress, patch.iteration)
+        preview.end()
+        result = run.result(time.monotonic() - was_read)
+        if patches is not None:
+            patches.write(encode_end(result.iterations))
+    was_filtered = time.monotonic()
     write_cloud(cloud.with_xyz(result.xyz), job.target, target_format)
+    size, sha256 = _settle(job.target)
+    ended = time.monotonic()
     return FileReport(
         format=target_format.name,
         points=len(cloud),
@@ -29,6 +71,71 @@ def denoise_file(denoiser: Filter, job: FileJob, *, on_progress: Callable[[float
         iterations=result.iterations,
         noise_before=result.noise_before,
         noise_after=result.noise_after,
-        seconds=result.seconds,
+        distances=result.distances,
+        displacement=_displacement(cloud.xyz, result.xyz),
+        seconds=ended - began,
+        timings={"read": was_read - began, "filter": was_filtered - was_read, "write": ended - was_filtered},
+        device=denoiser.device,
+        bytes=size,
+        sha256=sha256,
         warnings=result.warnings,
     )
+
+
+class _PatchFile:
+    """Append frames, each whole and at once, so that a reader can follow the file."""
+
+    def __init__(self, path: Path, points: int) -> None:
+        self._file: IO[bytes] = path.open("wb", buffering=0)
+        self.write(encode_header(points))
+
+    def __enter__(self) -> _PatchFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, frame: bytes) -> None:
+        self._file.write(frame)
+
+
+class _Preview:
+    """Keep the positions of a few points, evenly spread over the rows, and tell them after every pass."""
+
+    def __init__(self, points: int, tell: OnPreview | None) -> None:
+        self._rows = np.unique(np.linspace(0, points - 1, min(points, PREVIEW_POINTS)).astype(np.int64))
+        self._where = np.full(points if tell else 0, -1, dtype=np.int32)
+        if tell:
+            self._where[self._rows] = np.arange(len(self._rows))
+        self._xyz = np.full((len(self._rows), 3), np.nan)
+        self._iteration, self._tell = 0, tell
+
+    def add(self, iteration: int, indices: npt.NDArray[np.int64], xyz: npt.NDArray[np.float64]) -> None:
+        if self._tell is None:
+            return
+        if iteration != self._iteration:
+            self.end()
+            self._iteration = iteration
+        place = self._where[indices]
+        self._xyz[place[place >= 0]] = xyz[place >= 0]
+
+    def end(self) -> None:
+        """Tell what the pass has come to."""
+        if self._tell is not None and self._iteration > 0:
+            known = np.isfinite(self._xyz).all(axis=1)
+            self._tell(self._iteration, self._rows[known].tolist(), self._xyz[known].tolist())
+
+
+def _displacement(before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]) -> dict[str, float]:
+    with np.errstate(invalid="ignore"):
+        moved = np.linalg.norm(after - before, axis=1)
+    moved = moved[np.isfinite(moved)]
+    p50, p90, p99, most = (float(value) for value in np.percentile(moved, [50, 90, 99, 100]))
+    return {"p50": p50, "p90": p90, "p99": p99, "max": most, "mean": float(moved.mean())}
+
+
+def _settle(path: Path) -> tuple[int, str]:
+    """Return the size and sha256 of a file that is on the disk."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        return path.stat().st_size, hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""One spawned process per device on this machine; a dead one is replaced and its job run once more."""
+"""One spawned process per device on this machine; a dead one is replaced."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ import logging
 from collections.abc import Callable
 
 from straightpcf.points.errors import InternalError, StraightPCFError
-from straightpcf.service.backends.base import FileJob, FileReport
-from straightpcf.service.backends.process import WorkerDied, WorkerProcess
+from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
+from straightpcf.service.backends.process import WorkerProcess
 from straightpcf.service.backends.worker import WorkerSpec
 
 __all__ = ["LocalBackend"]
 
-ATTEMPTS = 2
 FIRST_RESTART_DELAY_SECONDS = 0.5
 MAX_RESTART_DELAY_SECONDS = 30.0
 STOP_PATIENCE_SECONDS = 5.0
@@ -35,11 +34,17 @@ class LocalBackend:
         self._turn = asyncio.Lock()  # fair, where a queue lets a newcomer overtake
         self._keepers: list[asyncio.Task[None]] = []
         self._warm: dict[WorkerProcess, str] = {}
+        self.restarts = 0
 
     @property
     def devices(self) -> tuple[str, ...]:
         """Name the device of every worker that is warm."""
         return tuple(self._warm.values())
+
+    @property
+    def slots(self) -> int:
+        """Say how many jobs run at once when every worker is warm."""
+        return len(self._specs)
 
     @property
     def failure(self) -> StraightPCFError | None:
@@ -56,21 +61,19 @@ class LocalBackend:
             keeper.cancel()
         await asyncio.gather(*self._keepers, return_exceptions=True)
 
-    async def run(
-        self, job: FileJob, *, on_start: Callable[[], None], on_progress: Callable[[float], None]
-    ) -> FileReport:
-        """Run a job, a second time if its worker dies; raises its error, or InternalError after the second death."""
-        for attempt in range(1, ATTEMPTS + 1):
-            worker = await self._claim()
-            on_start()
-            try:
-                return await worker.run(job, on_progress=on_progress)
-            except WorkerDied as death:
-                logger.warning("%s (attempt %d of %d)", death, attempt, ATTEMPTS)
-            finally:
-                if worker.alive:
-                    self._idle.put_nowait(worker)
-        raise InternalError(f"the worker died {ATTEMPTS} times on this cloud, which was then given up")
+    async def wait_idle(self) -> None:
+        """Return as soon as a worker is warm and free; raises `failure`."""
+        self._idle.put_nowait(await self._claim())
+
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
+        """Run a job on the first worker that is free; raises its error, or WorkerDied."""
+        worker = await self._claim()
+        try:
+            listener.on_start(self._warm.get(worker, ""))
+            return await worker.run(job, listener)
+        finally:
+            if worker.alive:
+                self._idle.put_nowait(worker)
 
     async def _claim(self) -> WorkerProcess:
         async with self._turn:
@@ -93,6 +96,7 @@ class LocalBackend:
                 logger.info("worker %s is ready on %s", worker.pid, self._warm[worker])
                 delay = FIRST_RESTART_DELAY_SECONDS
                 await asyncio.shield(worker.died)
+                self.restarts += 1
                 logger.warning("worker %s died; starting another", worker.pid)
             except WorkerDied as death:
                 logger.warning("%s; starting another in %g s", death, delay)

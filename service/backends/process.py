@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
-from collections.abc import Callable
 from typing import Any
 
 from straightpcf.points.errors import ERRORS_BY_CODE, InternalError
-from straightpcf.service.backends.base import FileJob, FileReport
-from straightpcf.service.backends.worker import Cancel, Done, Failed, Progress, Ready, WorkerSpec, run_worker
+from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
+from straightpcf.service.backends.worker import (
+    Cancel,
+    Done,
+    Failed,
+    Preview,
+    Progress,
+    Ready,
+    WorkerSpec,
+    run_worker,
+)
 
-__all__ = ["WorkerDied", "WorkerProcess"]
+__all__ = ["WorkerProcess"]
+
+# A worker that reads or writes a large file does not look at its pipe; after this it is replaced.
+CANCEL_PATIENCE_SECONDS = 0.8
 
 _SPAWN = multiprocessing.get_context("spawn")  # a forked CUDA context is broken, and a fork copies our sockets
-
-
-class WorkerDied(Exception):  # noqa: N818 - an event, never shown to a user
-    """Report a worker that ended without an answer (killed, out of memory, a crash in native code)."""
 
 
 class WorkerProcess:
@@ -36,7 +43,7 @@ class WorkerProcess:
         self.died: asyncio.Future[None] = self._loop.create_future()
         self._job: FileJob | None = None
         self._answer: asyncio.Future[FileReport] | None = None
-        self._on_progress: Callable[[float], None] | None = None
+        self._listener: Listener | None = None
 
     @property
     def alive(self) -> bool:
@@ -48,23 +55,25 @@ class WorkerProcess:
         """Name the process."""
         return self._process.pid
 
-    async def run(self, job: FileJob, *, on_progress: Callable[[float], None]) -> FileReport:
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
         """Run one job at a time; raises its error, or WorkerDied. When cancelled, wait until the worker has let go."""
         answer: asyncio.Future[FileReport] = self._loop.create_future()
-        self._job, self._answer, self._on_progress = job, answer, on_progress
+        self._job, self._answer, self._listener = job, answer, listener
         try:
             self._send(job)
             return await asyncio.shield(answer)
         except asyncio.CancelledError:
+            self._listener = None
             self._send(Cancel(job.id))
-            await asyncio.wait([answer])
-            answer.exception()  # seen: nobody wants it any more
+            await asyncio.wait([answer], timeout=CANCEL_PATIENCE_SECONDS)
             raise
         finally:
-            if not answer.done():  # cancelled twice: this worker is of no use until it ends
+            if not answer.done():  # cancelled, and too busy to notice: of no use until it ends
                 answer.cancel()
-                self._process.kill()
-            self._job = self._answer = self._on_progress = None
+                self._bury()
+            elif not answer.cancelled():
+                answer.exception()  # seen, whoever wants it
+            self._job = self._answer = self._listener = None
 
     async def stop(self, *, patience_seconds: float) -> None:
         """Ask the process to end, and make it after a while, or at once if it is still loading; reaps it."""
@@ -97,8 +106,10 @@ class WorkerProcess:
                 self.ready.set_result(device)
             case Failed(None, code, text):
                 self.ready.set_exception(ERRORS_BY_CODE.get(code, InternalError)(text))
-            case Progress(job_id, fraction) if self._concerns(job_id) and self._on_progress is not None:
-                self._on_progress(fraction)
+            case Progress(job_id, fraction, iteration) if self._concerns(job_id) and self._listener is not None:
+                self._listener.on_progress(fraction, iteration)
+            case Preview(job_id, iteration, indices, xyz) if self._concerns(job_id) and self._listener is not None:
+                self._listener.on_preview(iteration, indices, xyz)
             case Done(job_id, report) if self._concerns(job_id) and self._answer is not None:
                 self._answer.set_result(report)
             case Failed(job_id, code, text) if self._concerns(job_id) and self._answer is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import signal
 import time
@@ -10,14 +11,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
+from straightpcf.points.errors import InternalError, JobCanceled, SpoolFull, StraightPCFError, TooLarge
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
 
 if TYPE_CHECKING:
     from straightpcf.model.filter import Filter
 
-__all__ = ["Cancel", "Done", "Failed", "Progress", "Ready", "WorkerSpec", "run_worker"]
+__all__ = ["Cancel", "Done", "Failed", "Preview", "Progress", "Ready", "WorkerSpec", "run_worker"]
 
 PROGRESS_INTERVAL_SECONDS = 0.05
 WARM_UP_POINTS = 1200  # more than a patch, so that the usual path is the one that is warm
@@ -34,7 +35,7 @@ class WorkerSpec:
     threads: int | None
 
 
-# What crosses the pipe. To the worker: FileJob, Cancel, None to end. From it: the other four.
+# What crosses the pipe. To the worker: FileJob, Cancel, None to end. From it: the others.
 @dataclass(frozen=True)
 class Cancel:
     """Ask the worker to drop a job at its next patch."""
@@ -55,6 +56,17 @@ class Progress:
 
     job_id: str
     fraction: float
+    iteration: int
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Tell where a few points are after a pass."""
+
+    job_id: str
+    iteration: int
+    indices: list[int]
+    xyz: list[list[float]]
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,7 @@ def _load(spec: WorkerSpec) -> Filter:
 def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
     sent = 0.0
 
-    def on_progress(fraction: float) -> None:
+    def on_progress(fraction: float, iteration: int) -> None:
         nonlocal sent
         while pipe.poll():
             message = pipe.recv()
@@ -118,10 +130,13 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
                 raise JobCanceled(f"job {job.id} was canceled")
         if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS:
             sent = now
-            pipe.send(Progress(job.id, fraction))
+            pipe.send(Progress(job.id, fraction, iteration))
+
+    def on_preview(iteration: int, indices: list[int], xyz: list[list[float]]) -> None:
+        pipe.send(Preview(job.id, iteration, indices, xyz))
 
     try:
-        return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress))
+        return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview))
     except (EOFError, BrokenPipeError):
         raise
     except Exception as error:
@@ -131,6 +146,8 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
 def _failure(job_id: str, error: Exception) -> Failed:
     if isinstance(error, StraightPCFError):
         return Failed(job_id, error.code, error.message)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Failed(job_id, SpoolFull.code, "the server's disk has no room for the result")
     logger.exception("the worker met an error of no kind of ours")
     if isinstance(error, MemoryError):
         return Failed(job_id, TooLarge.code, "the cloud does not fit in this server's memory")

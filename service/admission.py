@@ -1,0 +1,56 @@
+"""What a server takes: limits on one request, on all that waits, on one key, on the disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from straightpcf.points.errors import QuotaExceeded, ServerBusy, SpoolFull, TooManyBytes
+from straightpcf.service.jobs.store import Load
+
+__all__ = ["Limits"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Bound what is taken; the fields are those of `Settings`."""
+
+    max_bytes: int
+    max_points: int
+    max_jobs: int = 1000
+    max_queued_points: int = 200_000_000
+    max_jobs_per_key: int = 1000
+    max_spool_bytes: int = 50 * 2**30
+    min_free_bytes: int = 0
+    max_sync_seconds: float = 300.0
+    result_ttl_seconds: float = 3600.0
+    row_ttl_seconds: float = 86400.0
+    shutdown_seconds: float = 30.0
+
+    def check_bytes(self, size: int) -> None:
+        """Raise TooManyBytes above the limit."""
+        if size > self.max_bytes:
+            raise TooManyBytes(f"the body has {size} bytes or more; this server takes {self.max_bytes}")
+
+    def check_queue(self, load: Load, *, weight: int = 0) -> None:
+        """Raise ServerBusy if `weight` more points (estimated) do not fit beside what waits and runs."""
+        if load.jobs >= self.max_jobs:
+            raise ServerBusy(f"{load.jobs} jobs are waiting or running; this server holds {self.max_jobs}")
+        if load.jobs > 0 and load.points + weight > self.max_queued_points:
+            raise ServerBusy(
+                f"{load.points} points are waiting or running and about {weight} would come; "
+                f"this server holds {self.max_queued_points}"
+            )
+
+    def check_key(self, load: Load) -> None:
+        """Raise QuotaExceeded if a key has as many unfinished jobs as it may."""
+        if load.jobs >= self.max_jobs_per_key:
+            raise QuotaExceeded(
+                f"{load.jobs} jobs of this key are waiting or running; it may have {self.max_jobs_per_key}"
+            )
+
+    def check_disk(self, load: Load, free_bytes: int, *, size: int) -> None:
+        """Raise SpoolFull if an input of `size` bytes and a result as large do not fit."""
+        if load.bytes + 2 * size > self.max_spool_bytes:
+            raise SpoolFull(f"{load.bytes} bytes of jobs are kept; this server keeps {self.max_spool_bytes}")
+        if free_bytes - 2 * size < self.min_free_bytes:
+            raise SpoolFull(f"the server's disk has {free_bytes} bytes left; {self.min_free_bytes} must stay free")

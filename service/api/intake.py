@@ -1,0 +1,82 @@
+"""From a request with a cloud to a committed job: the part that every route which takes one shares."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import PurePosixPath, PureWindowsPath
+
+from starlette.requests import Request
+
+from straightpcf.points.errors import InvalidOptions, InvalidRequest
+from straightpcf.points.formats import format_named
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.api.body import declared_size, receive_upload
+from straightpcf.service.engine import Engine, JobRequest
+from straightpcf.service.jobs.record import JobRecord
+
+__all__ = ["flag", "take_job"]
+
+OPTION_FIELDS = frozenset({"iterations", "seed", "strength"})
+KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
+MAX_NAME_LENGTH = 120
+MAX_KEY_LENGTH = 255
+
+
+async def take_job(
+    request: Request, owner: str, *, endpoint: str, id: str | None = None, more_fields: frozenset[str] = frozenset()
+) -> tuple[JobRecord, bool, Mapping[str, str]]:
+    """Receive the body and commit the job; return it, whether it is new, and every field that came with it."""
+    engine: Engine = request.app.state.engine
+    engine.check_room(size=declared_size(request))
+    key = _idempotency_key(request)
+    _parse_fields(request.query_params, more_fields)  # before the body, so that it need not be read
+    with engine.upload() as source:
+        upload = await receive_upload(request, source, limits=engine.limits)
+        fields = {**request.query_params, **upload.fields}
+        options, format = _parse_fields(fields, more_fields)
+        wanted = JobRequest(
+            options=options,
+            name=_file_name(fields.get("filename") or request.path_params.get("filename") or upload.name),
+            format=format,
+            owner=owner,
+            id=id,
+            idempotency_key=key,
+            endpoint=endpoint,
+            traceparent=request.headers.get("traceparent"),
+        )
+        record, created = await engine.submit(source, wanted)
+    return record, created, fields
+
+
+def flag(fields: Mapping[str, str], name: str) -> bool:
+    """Read a yes or no; raises InvalidOptions."""
+    text = fields.get(name, "false").strip().lower()
+    if text not in ("true", "false", "1", "0"):
+        raise InvalidOptions(f"{name} is {text[:40]!r}; it must be true or false")
+    return text in ("true", "1")
+
+
+def _parse_fields(fields: Mapping[str, str], more: frozenset[str]) -> tuple[DenoiseOptions, str | None]:
+    if unknown := set(fields) - KNOWN_FIELDS - more:
+        raise InvalidOptions(f"{min(unknown)[:40]!r} is no option; known: {', '.join(sorted(KNOWN_FIELDS | more))}")
+    options = DenoiseOptions.parse(**{name: fields[name] for name in OPTION_FIELDS & set(fields)})
+    for name in more & set(fields):
+        flag(fields, name)
+    if format := fields.get("format"):
+        format_named(format)
+    return options, format or None
+
+
+def _idempotency_key(request: Request) -> str | None:
+    key = request.headers.get("idempotency-key")
+    if key is not None and (not 0 < len(key) <= MAX_KEY_LENGTH or not key.isprintable()):
+        raise InvalidRequest(f"Idempotency-Key must be 1 to {MAX_KEY_LENGTH} printable characters, it has {len(key)}")
+    return key
+
+
+def _file_name(name: str | None) -> str | None:
+    """Keep the last part of what the client calls the file; it names a format and a download, never a path here."""
+    if name is None:
+        return None
+    last = PurePosixPath(PureWindowsPath(name).name).name
+    return "".join(char for char in last if char.isprintable())[-MAX_NAME_LENGTH:] or None

@@ -1,0 +1,153 @@
+"""The job routes: create, look, follow, cancel, fetch, delete."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import JSONResponse, Response
+
+from straightpcf.points.errors import InvalidRequest
+from straightpcf.service.api.auth import owner_of
+from straightpcf.service.api.download import result_response
+from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
+from straightpcf.service.api.intake import take_job
+from straightpcf.service.api.openapi import (
+    EVENTS_RESPONSES,
+    JOB_BODY,
+    JOB_RESPONSES,
+    QUERY_PARAMETERS,
+    RESULT_RESPONSES,
+    STREAM_RESPONSES,
+    problems,
+)
+from straightpcf.service.api.schemas import Job, JobPage, Report
+from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.record import JobRecord, JobState
+
+__all__ = ["job_response", "router"]
+
+MAX_WAIT_SECONDS = 60
+
+router = APIRouter(tags=["jobs"])
+Owner = Annotated[str, Depends(owner_of)]
+
+
+def job_response(record: JobRecord, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
+    """Show a job, with the place where it is."""
+    at = {"Location": f"/jobs/{record.id}", **(headers or {})}
+    return JSONResponse(Job.of(record).plain(), status_code=status, headers=at)
+
+
+@router.post(
+    "/jobs", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job",
+    openapi_extra={"requestBody": JOB_BODY, "parameters": QUERY_PARAMETERS},
+)  # fmt: skip
+async def create_job(request: Request, owner: Owner) -> Response:
+    """Take a cloud and answer at once; the job is on the disk by then."""
+    record, created, _ = await take_job(request, owner, endpoint="jobs")
+    return job_response(record, 202 if created else 200)
+
+
+@router.put(
+    "/jobs/{id}", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job with a chosen id",
+    openapi_extra={"requestBody": JOB_BODY, "parameters": QUERY_PARAMETERS},
+)  # fmt: skip
+async def put_job(id: str, request: Request, owner: Owner) -> Response:
+    """Make a job once, however often the same request comes."""
+    record, created, _ = await take_job(request, owner, endpoint="jobs", id=id)
+    return job_response(record, 202 if created else 200)
+
+
+@router.get("/jobs", response_model=JobPage, responses=problems(400, 401), summary="List jobs")
+async def list_jobs(
+    request: Request,
+    owner: Owner,
+    state: Annotated[list[JobState] | None, Query(description="Only these; may be repeated.")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(description="The next_cursor of the page before.")] = None,
+) -> JobPage:
+    """Show this key's jobs, newest first."""
+    engine: Engine = request.app.state.engine
+    records, next_cursor = await engine.list(owner=owner, states=state or (), limit=limit, cursor=cursor)
+    return JobPage(jobs=[Job.of(record) for record in records], next_cursor=next_cursor)
+
+
+@router.get("/jobs/{id}", response_model=Job, responses=problems(400, 401, 404), summary="Look at a job")
+async def get_job(
+    id: str,
+    request: Request,
+    owner: Owner,
+    wait: Annotated[float, Query(ge=0, le=MAX_WAIT_SECONDS, description="Seconds to wait for its end.")] = 0,
+) -> Job:
+    """Show a job, as soon as it is finished or the wait is over."""
+    engine: Engine = request.app.state.engine
+    return Job.of(await engine.wait(id, owner=owner, seconds=wait))
+
+
+@router.get("/jobs/{id}/events", response_class=Response, responses=EVENTS_RESPONSES, summary="Follow a job")
+async def job_events(
+    id: str,
+    request: Request,
+    owner: Owner,
+    after: Annotated[str | None, Query(description="As Last-Event-ID, for those who cannot set headers.")] = None,
+) -> Response:
+    """Send what happened so far and what happens next as server-sent events; `Last-Event-ID` goes on behind one."""
+    engine: Engine = request.app.state.engine
+    await engine.get(id, owner=owner)
+    from_id = last_event_id(request.headers.get("last-event-id"), after)
+    return event_stream(engine, id, owner, after=from_id, headers={})
+
+
+@router.post(
+    "/jobs/{id}/cancel", status_code=202, response_model=Job, summary="Cancel a job",
+    responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 404)},
+)  # fmt: skip
+async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
+    """Cancel a job that waits or runs; its worker is free within a second."""
+    engine: Engine = request.app.state.engine
+    before = await engine.get(id, owner=owner)
+    after = await engine.cancel(id, owner=owner)
+    return job_response(after, 200 if before.finished else 202)
+
+
+@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 404), summary="Delete a job")
+async def delete_job(id: str, request: Request, owner: Owner) -> None:
+    """Remove a job, its files and its events, whatever its state."""
+    engine: Engine = request.app.state.engine
+    await engine.delete(id, owner=owner)
+
+
+async def _result(id: str, request: Request, owner: Owner) -> Response:
+    """Send the result; `Range`, `If-Range` and `If-None-Match` are understood."""
+    engine: Engine = request.app.state.engine
+    path, record = await engine.result(id, owner=owner)
+    return result_response(request, path, record)
+
+
+_RESULT: dict[str, Any] = {"response_class": Response, "responses": RESULT_RESPONSES}
+router.get("/jobs/{id}/result", summary="Fetch the result", operation_id="get_result", **_RESULT)(_result)
+router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="head_result", **_RESULT)(_result)
+
+
+@router.get("/jobs/{id}/report", response_model=Report, responses=problems(401, 404, 409, 410), summary="The report")
+async def job_report(id: str, request: Request, owner: Owner) -> Report:
+    """Show displacement, noise before and after, passes, timings and warnings."""
+    engine: Engine = request.app.state.engine
+    _, record = await engine.result(id, owner=owner)
+    return Report.model_validate(record.report)
+
+
+@router.get("/jobs/{id}/stream", response_class=Response, responses=STREAM_RESPONSES, summary="Patches as they finish")
+async def job_stream(id: str, request: Request, owner: Owner) -> Response:
+    """Send finished patches: framed bytes, or lines of JSON with `Accept: application/x-ndjson` (docs/api.md)."""
+    engine: Engine = request.app.state.engine
+    record = await engine.get(id, owner=owner)
+    if record.state == "expired":
+        await engine.result(id, owner=owner)  # raises what is to be said
+    if record.error is not None:
+        raise record.error
+    accept = request.headers.get("accept", "*/*")
+    if len(accept) > 1000:
+        raise InvalidRequest(f"Accept has {len(accept)} characters")
+    return patch_stream(engine, id, owner, as_json=NDJSON_MEDIA_TYPE in accept)

@@ -1,0 +1,116 @@
+"""The files of jobs: uploads on their way in, one folder per job, and a lock per server that tells whether it lives."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+__all__ = ["INPUT", "JobFolders", "digest_of"]
+
+INPUT = "input"
+_ORPHAN_SECONDS = 3600.0  # an upload or folder that no job owns is given up after this
+
+
+class JobFolders:
+    """Own `<data_dir>/jobs`, `incoming` and `servers`; several servers may share them."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._jobs, self._incoming, self._servers = (data_dir / name for name in ("jobs", "incoming", "servers"))
+        for folder in (self._jobs, self._incoming, self._servers):
+            folder.mkdir(parents=True, exist_ok=True)
+        self.server = uuid.uuid4().hex
+        self._lock: IO[bytes] = self._lock_path(self.server).open("wb")
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def close(self) -> None:
+        """Let go of this server's lock."""
+        self._lock_path(self.server).unlink(missing_ok=True)
+        self._lock.close()
+
+    @contextmanager
+    def upload(self) -> Iterator[Path]:
+        """Lend the path of a file to be; whatever is still there at the end is removed."""
+        handle, name = tempfile.mkstemp(dir=self._incoming)
+        os.close(handle)
+        try:
+            yield Path(name)
+        finally:
+            Path(name).unlink(missing_ok=True)
+
+    def path(self, folder: str) -> Path:
+        """Return where a job's folder is."""
+        return self._jobs / folder
+
+    def adopt(self, upload: Path, name: str) -> None:
+        """Make an upload the input of a job that is about to be committed, durably."""
+        folder = self.path(name)
+        folder.mkdir()
+        with upload.open("rb") as file:
+            os.fsync(file.fileno())
+        upload.replace(folder / INPUT)
+        for path in (folder, self._jobs):
+            _sync(path)
+
+    def remove(self, folder: str) -> None:
+        """Remove a job's files."""
+        shutil.rmtree(self.path(folder), ignore_errors=True)
+
+    def free_bytes(self) -> int:
+        """Return how much room the disk has."""
+        return shutil.disk_usage(self._jobs).free
+
+    def dead_servers(self, servers: Collection[str]) -> list[str]:
+        """Return those servers whose lock nobody holds any more, and remove their locks."""
+        dead = []
+        for server in servers:
+            path = self._lock_path(server)
+            try:
+                with path.open("rb") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except FileNotFoundError:
+                pass
+            except OSError:
+                continue  # it lives
+            path.unlink(missing_ok=True)
+            dead.append(server)
+        return dead
+
+    def orphans(self) -> list[str]:
+        """Name job folders that are old enough to have been committed, and drop uploads that nobody finished."""
+        old = time.time() - _ORPHAN_SECONDS
+        for upload in self._incoming.iterdir():
+            with suppress(FileNotFoundError):
+                if upload.stat().st_mtime < old:
+                    upload.unlink()
+        names = []
+        for folder in self._jobs.iterdir():
+            with suppress(FileNotFoundError):
+                if folder.stat().st_mtime < old:
+                    names.append(folder.name)
+        return names
+
+    def _lock_path(self, server: str) -> Path:
+        return self._servers / f"{server}.lock"
+
+
+def digest_of(path: Path) -> str:
+    """Return a file's sha256 in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,82 @@
+"""What a job is, and what happened to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal, get_args
+
+from straightpcf.points.errors import StraightPCFError
+from straightpcf.points.options import DenoiseOptions
+
+__all__ = ["FINISHED", "STATES", "Claim", "EventKind", "JobEvent", "JobRecord", "JobState", "ResultInfo"]
+
+JobState = Literal["queued", "starting", "processing", "succeeded", "failed", "canceled", "expired"]
+EventKind = Literal["queued", "start", "progress", "preview", "output", "log", "completed"]
+STATES: tuple[JobState, ...] = get_args(JobState)
+FINISHED: frozenset[JobState] = frozenset({"succeeded", "failed", "canceled", "expired"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultInfo:
+    """Describe a result file; sha256 in hex."""
+
+    bytes: int
+    sha256: str
+    media_type: str
+    filename: str
+    format: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobRecord:
+    """Hold one job as it is in the store; times in UTC.
+
+    owner: the fingerprint of the key that made it, "" without keys. folder: the name of its folder of files. bytes,
+    points: of the input, points None until it was read. attempts: how often a worker took it. position: jobs before
+    it while it is queued. error: of a failed or canceled job. report: docs/api.md says what is in it.
+    """
+
+    id: str
+    owner: str
+    folder: str
+    state: JobState
+    name: str | None
+    format: str | None
+    options: DenoiseOptions
+    bytes: int
+    points: int | None
+    progress: float
+    attempts: int
+    position: int | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None
+    error: StraightPCFError | None
+    result: ResultInfo | None
+    report: dict[str, Any] | None
+    traceparent: str | None
+
+    @property
+    def finished(self) -> bool:
+        """Tell whether nothing more happens to it."""
+        return self.state in FINISHED
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobEvent:
+    """Hold one thing that happened; seq counts from 1 within the job."""
+
+    seq: int
+    kind: EventKind
+    data: dict[str, Any]
+    at: datetime
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """Hold the right to work on a job: `fence` grows with every claim, and an older one can write nothing."""
+
+    record: JobRecord
+    fence: int

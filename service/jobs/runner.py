@@ -1,0 +1,240 @@
+"""Work on queued jobs: claim, hand to the backend, write down what happens, deliver; one loop per worker."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from typing import Any, Literal, Protocol
+
+from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError
+from straightpcf.points.formats import format_named
+from straightpcf.service.backends.base import Backend, FileJob, FileReport, WorkerDied
+from straightpcf.service.jobs.folders import INPUT, JobFolders
+from straightpcf.service.jobs.record import Claim, EventKind, ResultInfo
+from straightpcf.service.jobs.result_name import result_name
+from straightpcf.service.jobs.store import JobStore
+
+__all__ = ["JobRunner"]
+
+MAX_ATTEMPTS = 3
+LEASE_SECONDS = 15.0
+HEARTBEAT_SECONDS = 1.0
+POLL_SECONDS = 1.0  # for jobs that another server took in
+
+Reason = Literal["canceled", "shutdown", "lost"]
+
+logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
+
+
+class StoreCall(Protocol):
+    """Run one method of the store on its thread."""
+
+    def __call__(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Awaitable[Any]: ...
+
+
+class JobRunner:
+    """Run jobs on a backend under a lease that a heartbeat renews."""
+
+    def __init__(
+        self, backend: Backend, *, folders: JobFolders, call: StoreCall, notify: Callable[[str], None],
+        max_points: int, result_ttl_seconds: float,
+    ) -> None:  # fmt: skip
+        self._backend, self._folders, self._call, self._notify = backend, folders, call, notify
+        self._max_points, self._ttl = max_points, result_ttl_seconds
+        self._running: dict[str, _Running] = {}
+        self._work = asyncio.Event()
+        self._loops: list[asyncio.Task[None]] = []
+        self._stopping = False
+
+    def start(self) -> None:
+        """Begin to take jobs as soon as workers are warm."""
+        self._loops = [asyncio.create_task(self._serve()) for _ in range(self._backend.slots)]
+        self._loops.append(asyncio.create_task(self._beat()))
+
+    def wake(self) -> None:
+        """Tell that there is a new job."""
+        self._work.set()
+
+    async def cancel(self, id: str) -> None:
+        """Stop working on a job, if this server does."""
+        if (running := self._running.get(id)) is not None:
+            await running.end("canceled")
+
+    async def stop(self, *, patience_seconds: float) -> None:
+        """Take nothing more, let what runs finish for a while, and put back what did not."""
+        self._stopping = True
+        if tasks := [running.task for running in self._running.values()]:
+            await asyncio.wait(tasks, timeout=patience_seconds)
+        await asyncio.gather(*(running.end("shutdown") for running in list(self._running.values())))
+        for loop in self._loops:
+            loop.cancel()
+        await asyncio.gather(*self._loops, return_exceptions=True)
+
+    async def _serve(self) -> None:
+        while not self._stopping:
+            try:
+                await self._backend.wait_idle()
+                self._work.clear()
+                claim = await self._call(JobStore.claim, self._folders.server, LEASE_SECONDS)
+                if claim is None:
+                    await self._wait_for_work()
+                    continue
+                running = _Running(asyncio.create_task(self._run(claim)))
+                self._running[claim.record.id] = running
+                try:
+                    await asyncio.wait([running.task])
+                finally:
+                    del self._running[claim.record.id]
+                    self._notify(claim.record.id)
+                if not running.task.cancelled() and (fault := running.task.exception()) is not None:
+                    raise fault
+            except StraightPCFError as failure:  # no worker will ever start
+                logger.error("no more jobs are run here: %s", failure)
+                return
+            except Exception:
+                logger.exception("a job could not be written down; its lease will run out")
+                await asyncio.sleep(POLL_SECONDS)
+
+    async def _wait_for_work(self) -> None:
+        try:
+            async with asyncio.timeout(POLL_SECONDS):
+                await self._work.wait()
+        except TimeoutError:
+            pass
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(HEARTBEAT_SECONDS)
+            if not self._running:
+                continue
+            try:
+                held, canceled = await self._call(JobStore.extend, self._folders.server, LEASE_SECONDS)
+            except Exception:
+                logger.exception("the leases could not be renewed; another try follows")
+                continue
+            for id, running in list(self._running.items()):
+                if id in canceled or id not in held:
+                    await running.end("canceled" if id in canceled else "lost")
+
+    async def _run(self, claim: Claim) -> None:
+        record, fence = claim.record, claim.fence
+        folder = self._folders.path(record.folder)
+        target = folder / f"result-{record.attempts}"  # an attempt that comes back from the dead harms no later one
+        log = _Log(claim, self._call, self._notify)
+        try:
+            try:
+                report = await self._backend.run(
+                    FileJob(
+                        id=record.id,
+                        source=folder / INPUT,
+                        target=target,
+                        options=record.options,
+                        max_points=self._max_points,
+                        name=record.name,
+                        format=record.format,
+                        patches=folder / f"patches-{record.attempts}",
+                    ),
+                    log,
+                )
+            finally:
+                await log.close()
+            result = _result_info(record.name, report)
+            await self._call(
+                JobStore.succeed, record.id, fence, result=result, report=_report(report), file=target.name,
+                expires_in=self._ttl,
+            )  # fmt: skip
+        except WorkerDied as death:
+            await self._after_death(claim, death)
+        except StraightPCFError as error:
+            await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
+        except asyncio.CancelledError:
+            reason = self._running[record.id].reason
+            if reason == "canceled":
+                canceled = JobCanceled(f"job {record.id} was canceled")
+                await self._call(JobStore.fail, record.id, fence, canceled, expires_in=self._ttl)
+            elif reason == "shutdown":
+                await self._call(JobStore.release, record.id, fence, "the server shut down; the job starts again")
+
+    async def _after_death(self, claim: Claim, death: WorkerDied) -> None:
+        record, fence = claim.record, claim.fence
+        logger.warning("%s (attempt %d of %d)", death, record.attempts, MAX_ATTEMPTS)
+        if record.attempts < MAX_ATTEMPTS:
+            await self._call(JobStore.release, record.id, fence, "its worker died; the job starts again")
+        else:
+            error = InternalError(f"the worker died {MAX_ATTEMPTS} times on this cloud, which was then given up")
+            await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
+
+
+class _Running:
+    """Hold one job's task and why it was ended early."""
+
+    def __init__(self, task: asyncio.Task[None]) -> None:
+        self.task = task
+        self.reason: Reason | None = None
+
+    async def end(self, reason: Reason) -> None:
+        if self.reason is None and not self.task.done():
+            self.reason = reason
+            self.task.cancel()
+        await asyncio.wait([self.task])
+
+
+class _Log:
+    """Write down what a worker tells, in order and off the callbacks, which may not wait."""
+
+    def __init__(self, claim: Claim, call: StoreCall, notify: Callable[[str], None]) -> None:
+        self._id, self._fence = claim.record.id, claim.fence
+        self._call, self._notify = call, notify
+        self._told: asyncio.Queue[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None] = asyncio.Queue()
+        self._progress, self._iteration = 0.0, 0
+        self._writer = asyncio.create_task(self._write())
+
+    def on_start(self, device: str) -> None:
+        self._tell(JobStore.begin, device=device)
+
+    def on_progress(self, fraction: float, iteration: int) -> None:
+        if fraction - self._progress >= 0.01 or iteration != self._iteration:  # the log of a job stays short
+            self._progress, self._iteration = fraction, iteration
+            data = {"progress": fraction, "iteration": iteration}
+            self._tell(JobStore.note, "progress", data, progress=fraction)
+        else:
+            self._notify(self._id)  # for those who follow the patches
+
+    def on_preview(self, iteration: int, indices: list[int], xyz: list[list[float]]) -> None:
+        kind: EventKind = "preview"
+        self._tell(JobStore.note, kind, {"iteration": iteration, "indices": indices, "xyz": xyz})
+
+    async def close(self) -> None:
+        """Return when everything is written, also if the caller is being cancelled."""
+        self._told.put_nowait(None)
+        await asyncio.wait([self._writer])
+
+    def _tell(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> None:
+        self._told.put_nowait((function, args, kwargs))
+
+    async def _write(self) -> None:
+        while (told := await self._told.get()) is not None:
+            function, args, kwargs = told
+            await self._call(function, self._id, self._fence, *args, **kwargs)
+            self._notify(self._id)
+
+
+def _result_info(name: str | None, report: FileReport) -> ResultInfo:
+    return ResultInfo(
+        bytes=report.bytes,
+        sha256=report.sha256,
+        media_type=format_named(report.format).media_type,
+        filename=result_name(name, report.format),
+        format=report.format,
+    )
+
+
+def _report(report: FileReport) -> dict[str, Any]:
+    """Return the report as docs/api.md has it; JSON has no NaN."""
+    values = {name: value for name, value in asdict(report).items() if name not in ("bytes", "sha256")}
+    for name in ("noise_before", "noise_after"):
+        values[name] = values[name] if math.isfinite(values[name]) else None
+    return values

@@ -1,0 +1,40 @@
+CREATE TABLE IF NOT EXISTS jobs (
+  seq INTEGER PRIMARY KEY AUTOINCREMENT,
+  id TEXT NOT NULL UNIQUE,
+  owner TEXT NOT NULL,
+  folder TEXT NOT NULL UNIQUE,        -- inside <data_dir>/jobs: new for every job, so that no request touches another's files
+  state TEXT NOT NULL,
+  name TEXT,
+  format TEXT,
+  options TEXT NOT NULL,
+  bytes INTEGER NOT NULL,
+  weight INTEGER NOT NULL,            -- points, as estimated before the file is read: what admission counts
+  points INTEGER,
+  progress REAL NOT NULL DEFAULT 0,
+  attempts INTEGER NOT NULL DEFAULT 0,
+  fence INTEGER NOT NULL DEFAULT 0,
+  server TEXT,                        -- who works on it
+  lease_until REAL,                   -- and until when that is believed
+  cancel_requested INTEGER NOT NULL DEFAULT 0,
+  created_at REAL NOT NULL,
+  started_at REAL,
+  finished_at REAL,
+  expires_at REAL,
+  error TEXT,
+  result TEXT,
+  report TEXT,
+  traceparent TEXT,
+  idempotency_key TEXT,
+  digest TEXT NOT NULL                -- of the request: the same key or id with another digest is a conflict
+);
+CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state, seq);
+CREATE INDEX IF NOT EXISTS jobs_by_owner ON jobs (owner, seq);
+CREATE UNIQUE INDEX IF NOT EXISTS jobs_by_key ON jobs (owner, idempotency_key) WHERE idempotency_key IS NOT NULL;
+CREATE TABLE IF NOT EXISTS events (
+  job INTEGER NOT NULL REFERENCES jobs (seq) ON DELETE CASCADE,
+  seq INTEGER NOT NULL,
+  kind TEXT NOT NULL,
+  data TEXT NOT NULL,
+  at REAL NOT NULL,
+  PRIMARY KEY (job, seq)
+) WITHOUT ROWID;

@@ -1,0 +1,387 @@
+"""The durable store: one SQLite file in WAL mode; every method is one transaction.
+
+Calls block, so the engine makes them on a thread of their own. Several servers may share the file: a job is worked on
+by whoever holds its lease, and a write with an older fence changes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from straightpcf.points.errors import (
+    ERRORS_BY_CODE,
+    IdConflict,
+    IdempotencyConflict,
+    InternalError,
+    InvalidRequest,
+    NotFound,
+    StraightPCFError,
+)
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.jobs.record import (
+    FINISHED,
+    STATES,
+    Claim,
+    EventKind,
+    JobEvent,
+    JobRecord,
+    JobState,
+    ResultInfo,
+)
+
+__all__ = ["JobStore", "Load", "NewJob"]
+
+_BUSY_SECONDS = 30.0
+_ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
+_WORKING: tuple[JobState, ...] = ("starting", "processing")
+_PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewJob:
+    """Describe a job to be; weight: its points, estimated; digest: of the whole request."""
+
+    id: str
+    owner: str
+    folder: str
+    name: str | None
+    format: str | None
+    options: DenoiseOptions
+    bytes: int
+    weight: int
+    digest: str
+    idempotency_key: str | None = None
+    traceparent: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """Sum up unfinished jobs and what lies on the disk: jobs and estimated points that wait or run, bytes kept."""
+
+    jobs: int
+    points: int
+    bytes: int
+
+
+class JobStore:
+    """Keep jobs and their events; use from one thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._db = sqlite3.connect(path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False)
+        self._db.row_factory = sqlite3.Row
+        self._db.execute("PRAGMA journal_mode = WAL")
+        self._db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
+        self._db.execute("PRAGMA foreign_keys = ON")
+        self._db.executescript(files(__package__).joinpath("schema.sql").read_text())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    # --- what clients ask for
+
+    def create(self, job: NewJob) -> tuple[JobRecord, bool]:
+        """Commit a queued job and return it with True, or the one that the same request made before with False.
+
+        Raises IdempotencyConflict, IdConflict where another request has the key or the id.
+        """
+        with self._transaction():
+            if (known := self._known(job)) is not None:
+                return self._record(known), False
+            now = time.time()
+            self._db.execute(
+                "INSERT INTO jobs (id, owner, folder, state, name, format, options, bytes, weight, created_at,"
+                " traceparent, idempotency_key, digest) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (job.id, job.owner, job.folder, job.name, job.format, json.dumps(asdict(job.options)), job.bytes,
+                 job.weight, now, job.traceparent, job.idempotency_key, job.digest),
+            )  # fmt: skip
+            record = self._record(self._row(job.id))
+            self._add_event(job.id, "queued", {"position": record.position})
+            return record, True
+
+    def match(self, job: NewJob) -> JobRecord | None:
+        """Return what `create` would return with False; raises like it."""
+        row = self._known(job)
+        return None if row is None else self._record(row)
+
+    def get(self, id: str, owner: str | None = None) -> JobRecord:
+        """Return a job; raises NotFound, also for a job of another owner."""
+        return self._record(self._row(id, owner))
+
+    def page(
+        self, *, owner: str, states: Collection[JobState] = (), limit: int = 50, cursor: str | None = None
+    ) -> tuple[list[JobRecord], str | None]:
+        """Return a page, newest first, and the cursor of the next one; raises InvalidRequest on a broken cursor."""
+        if unknown := set(states) - set(STATES):
+            raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
+        where, values = ["owner = ?"], [owner]
+        if states:
+            where.append(f"state IN ({', '.join('?' * len(states))})")
+            values += states
+        if cursor is not None:
+            if not cursor.isascii() or not cursor.isdigit() or len(cursor) > 18:
+                raise InvalidRequest(f"cursor is {cursor[:40]!r}; it must be the next_cursor of a page")
+            where.append("seq < ?")
+            values.append(cursor)
+        query = f"SELECT * FROM jobs WHERE {' AND '.join(where)} ORDER BY seq DESC LIMIT ?"
+        rows = self._db.execute(query, [*values, limit + 1]).fetchall()
+        more = len(rows) > limit
+        return [self._record(row) for row in rows[:limit]], str(rows[limit - 1]["seq"]) if more else None
+
+    def events(self, id: str, after: int = 0) -> list[JobEvent]:
+        """Return what happened behind event `after`."""
+        query = "SELECT e.* FROM events e JOIN jobs j ON e.job = j.seq WHERE j.id = ? AND e.seq > ? ORDER BY e.seq"
+        return [
+            JobEvent(seq=row["seq"], kind=row["kind"], data=json.loads(row["data"]), at=_time(row["at"]))
+            for row in self._db.execute(query, (id, after))
+        ]
+
+    def request_cancel(self, id: str, *, expires_in: float) -> JobRecord:
+        """Cancel a queued job at once; mark one that is worked on, for its server to see."""
+        with self._transaction():
+            row = self._row(id)
+            if row["state"] == "queued":
+                error = {"code": "job_canceled", "detail": f"job {id} was canceled"}
+                self._end(id, "canceled", error=error, expires_in=expires_in)
+            elif row["state"] in _WORKING:
+                self._db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (id,))
+            return self._record(self._row(id))
+
+    def delete(self, id: str) -> None:
+        """Remove a job and its events; the fence of whoever works on it is void from now on."""
+        with self._transaction():
+            self._db.execute("DELETE FROM jobs WHERE id = ?", (id,))
+
+    def load(self, owner: str | None = None) -> Load:
+        """Sum up what waits and runs, for one owner or for all, and the bytes of all inputs and results."""
+        where, values = ("", []) if owner is None else ("AND owner = ?", [owner])
+        query = f"SELECT COUNT(*), TOTAL(weight) FROM jobs WHERE state IN {_ACTIVE} {where}"
+        jobs, points = self._db.execute(query, values).fetchone()
+        query = (
+            "SELECT TOTAL(bytes + IFNULL(json_extract(result, '$.bytes'), 0)) FROM jobs WHERE state <> 'expired' "
+            + where
+        )
+        (kept,) = self._db.execute(query, values).fetchone()
+        return Load(jobs=jobs, points=int(points), bytes=int(kept))
+
+    def counts(self) -> dict[str, int]:
+        """Count jobs by state."""
+        return dict(self._db.execute("SELECT state, COUNT(*) FROM jobs GROUP BY state").fetchall())
+
+    # --- what the server that works on jobs asks for
+
+    def claim(self, server: str, lease_seconds: float) -> Claim | None:
+        """Take the oldest queued job, or none."""
+        with self._transaction():
+            now = time.time()
+            row = self._db.execute(
+                "UPDATE jobs SET state = 'starting', fence = fence + 1, attempts = attempts + 1, server = ?,"
+                " lease_until = ?, started_at = IFNULL(started_at, ?), progress = 0 WHERE seq ="
+                " (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
+                (server, now + lease_seconds, now),
+            ).fetchone()
+            return None if row is None else Claim(record=self._record(row), fence=row["fence"])
+
+    def extend(self, server: str, lease_seconds: float) -> tuple[set[str], set[str]]:
+        """Renew the leases of a server; return the ids it still holds, and those of them that should be canceled."""
+        with self._transaction():
+            rows = self._db.execute(
+                f"UPDATE jobs SET lease_until = ? WHERE server = ? AND state IN {_WORKING}"
+                " RETURNING id, cancel_requested",
+                (time.time() + lease_seconds, server),
+            ).fetchall()
+        return {row["id"] for row in rows}, {row["id"] for row in rows if row["cancel_requested"]}
+
+    def begin(self, id: str, fence: int, *, device: str) -> bool:
+        """Tell that a worker has begun; False if the fence is old."""
+        with self._transaction():
+            mine = self._update(id, fence, "state = 'processing'")
+            if mine:
+                attempts = self._row(id)["attempts"]
+                self._add_event(id, "start", {"attempt": attempts, "device": device})
+            return mine
+
+    def note(
+        self, id: str, fence: int, kind: EventKind, data: dict[str, Any], *, progress: float | None = None,
+        points: int | None = None,
+    ) -> bool:  # fmt: skip
+        """Add an event of a running job, and what is known by then; False if the fence is old."""
+        with self._transaction():
+            set_ = "progress = IFNULL(?, progress), points = IFNULL(?, points)"
+            mine = self._update(id, fence, set_, progress, points)
+            if mine:
+                self._add_event(id, kind, data)
+            return mine
+
+    def succeed(
+        self, id: str, fence: int, *, result: ResultInfo, report: dict[str, Any], file: str, expires_in: float
+    ) -> bool:
+        """Deliver: from this commit on, and not before, the result `file` in the job's folder is the result."""
+        with self._transaction():
+            kept = json.dumps({**asdict(result), "file": file})
+            set_ = "progress = 1, points = ?, result = ?, report = ?"
+            if not self._update(id, fence, set_, report["points"], kept, json.dumps(report)):
+                return False
+            said = {key: asdict(result)[key] for key in ("bytes", "sha256", "filename", "media_type")}
+            for message in report.get("warnings", ()):
+                self._add_event(id, "log", {"level": "warning", "message": message})
+            self._add_event(id, "output", said)
+            self._end(id, "succeeded", expires_in=expires_in)
+            return True
+
+    def fail(self, id: str, fence: int, error: StraightPCFError, *, expires_in: float) -> bool:
+        """End a job that cannot succeed, or was canceled while it ran."""
+        with self._transaction():
+            if not self._update(id, fence, "progress = progress"):
+                return False
+            state: JobState = "canceled" if error.code == "job_canceled" else "failed"
+            self._end(id, state, error={"code": error.code, "detail": error.message}, expires_in=expires_in)
+            return True
+
+    def release(self, id: str, fence: int, message: str) -> bool:
+        """Put a job back into its place in the queue."""
+        with self._transaction():
+            mine = self._update(id, fence, "state = 'queued', server = NULL, lease_until = NULL, progress = 0")
+            if mine:
+                self._requeued(id, message)
+            return mine
+
+    def recover(self, dead_servers: Collection[str] = ()) -> list[str]:
+        """Put back the jobs whose lease ran out, or whose server is known to be dead; return their ids."""
+        with self._transaction():
+            rows = self._db.execute(
+                f"UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0, fence = fence + 1"
+                f" WHERE state IN {_WORKING} AND (lease_until < ? OR server IN ({', '.join('?' * len(dead_servers))}))"
+                " RETURNING id",
+                (time.time(), *dead_servers),
+            ).fetchall()
+            for row in rows:
+                self._requeued(row["id"], "its server died; the job starts again")
+        return [row["id"] for row in rows]
+
+    def expire(self, *, rows_after: float) -> list[str]:
+        """Mark what is over its time, forget what has been so for rows_after seconds; return folders to remove."""
+        with self._transaction():
+            now = time.time()
+            query = (
+                f"UPDATE jobs SET state = 'expired' WHERE state IN {_finished()} AND expires_at < ? RETURNING folder"
+            )
+            expired = [row["folder"] for row in self._db.execute(query, (now,)).fetchall()]
+            self._db.execute("DELETE FROM jobs WHERE state = 'expired' AND expires_at < ?", (now - rows_after,))
+        return expired
+
+    def servers(self) -> set[str]:
+        """Name the servers that hold jobs."""
+        query = f"SELECT DISTINCT server FROM jobs WHERE state IN {_WORKING}"
+        return {row["server"] for row in self._db.execute(query)}
+
+    def unknown(self, folders: Collection[str]) -> list[str]:
+        """Return those folders that no job owns."""
+        query = "SELECT 1 FROM jobs WHERE folder = ? AND state <> 'expired'"
+        return [folder for folder in folders if self._db.execute(query, (folder,)).fetchone() is None]
+
+    def result_file(self, id: str) -> str:
+        """Name the result file inside the job's folder."""
+        return str(json.loads(self._row(id)["result"])["file"])
+
+    # --- inside a transaction
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+
+    def _known(self, job: NewJob) -> sqlite3.Row | None:
+        if job.idempotency_key is not None:
+            query = "SELECT * FROM jobs WHERE owner = ? AND idempotency_key = ?"
+            row = self._db.execute(query, (job.owner, job.idempotency_key)).fetchone()
+            if row is not None and row["digest"] != job.digest:
+                raise IdempotencyConflict(
+                    f"idempotency key {job.idempotency_key[:40]!r} came with another request before"
+                )
+            if row is not None:
+                return row  # type: ignore[no-any-return]
+        row = self._db.execute("SELECT * FROM jobs WHERE id = ?", (job.id,)).fetchone()
+        if row is not None and (row["digest"] != job.digest or row["owner"] != job.owner):
+            raise IdConflict(f"job id {job.id!r} is taken by another request")
+        return row  # type: ignore[no-any-return]
+
+    def _row(self, id: str, owner: str | None = None) -> sqlite3.Row:
+        row = self._db.execute("SELECT * FROM jobs WHERE id = ?", (id,)).fetchone()
+        if row is None or (owner is not None and row["owner"] != owner):
+            raise NotFound(f"there is no job {id[:64]!r}")
+        return row  # type: ignore[no-any-return]
+
+    def _update(self, id: str, fence: int, set_: str, *values: object) -> bool:
+        query = f"UPDATE jobs SET {set_} WHERE id = ? AND fence = ? AND state IN {_WORKING}"
+        return self._db.execute(query, (*values, id, fence)).rowcount == 1
+
+    def _end(self, id: str, state: JobState, *, error: dict[str, str] | None = None, expires_in: float = 0.0) -> None:
+        now = time.time()
+        self._db.execute(
+            "UPDATE jobs SET state = ?, error = ?, finished_at = ?, expires_at = ?, lease_until = NULL, server = NULL"
+            " WHERE id = ?",
+            (state, None if error is None else json.dumps(error), now, now + expires_in, id),
+        )
+        self._add_event(id, "completed", {"state": state})
+
+    def _requeued(self, id: str, message: str) -> None:
+        self._add_event(id, "log", {"level": "warning", "message": message})
+        self._add_event(id, "queued", {"position": self._record(self._row(id)).position})
+
+    def _add_event(self, id: str, kind: EventKind, data: dict[str, Any]) -> None:
+        self._db.execute(
+            "INSERT INTO events SELECT seq, 1 + IFNULL((SELECT MAX(seq) FROM events WHERE job = jobs.seq), 0), ?, ?, ?"
+            " FROM jobs WHERE id = ?",
+            (kind, json.dumps(data, allow_nan=False), time.time(), id),
+        )
+
+    def _record(self, row: sqlite3.Row) -> JobRecord:
+        position = None
+        if row["state"] == "queued":
+            query = "SELECT COUNT(*) FROM jobs WHERE state = 'queued' AND seq < ?"
+            (position,) = self._db.execute(query, (row["seq"],)).fetchone()
+        result = None if row["result"] is None else json.loads(row["result"])
+        return JobRecord(
+            **{name: row[name] for name in _PLAIN},
+            progress=row["progress"],
+            position=position,
+            options=DenoiseOptions(**json.loads(row["options"])),
+            created_at=_time(row["created_at"]),
+            started_at=_time_or_none(row["started_at"]),
+            finished_at=_time_or_none(row["finished_at"]),
+            expires_at=_time_or_none(row["expires_at"]),
+            error=None if row["error"] is None else _error(json.loads(row["error"])),
+            result=None if result is None else ResultInfo(**{k: v for k, v in result.items() if k != "file"}),
+            report=None if row["report"] is None else json.loads(row["report"]),
+        )  # fmt: skip
+
+
+def _error(saved: dict[str, str]) -> StraightPCFError:
+    return ERRORS_BY_CODE.get(saved["code"], InternalError)(saved["detail"])
+
+
+def _finished() -> str:
+    return str(tuple(sorted(FINISHED - {"expired"})))
+
+
+def _time(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _time_or_none(seconds: float | None) -> datetime | None:
+    return None if seconds is None else _time(seconds)

@@ -1,0 +1,84 @@
+"""Metrics in the Prometheus text format, on a registry of the app's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.registry import Collector
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.record import STATES
+
+__all__ = ["MetricsMiddleware", "Telemetry"]
+
+
+class Telemetry:
+    """Count requests, and read the engine when someone asks."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.registry = CollectorRegistry()
+        labels = ("method", "route", "status")
+        self.requests = Counter("straightpcf_http_requests", "Requests answered.", labels, registry=self.registry)
+        self.seconds = Histogram(
+            "straightpcf_http_request_seconds", "From request to the end of the answer.", ("method", "route"),
+            buckets=(0.005, 0.02, 0.1, 0.5, 1, 2, 5, 10, 30, 60, 300), registry=self.registry,
+        )  # fmt: skip
+        self.registry.register(_EngineCollector(engine))
+
+    async def endpoint(self, request: Request) -> Response:
+        """Answer GET /metrics."""
+        return Response(generate_latest(self.registry), media_type=CONTENT_TYPE_LATEST)
+
+
+class _EngineCollector(Collector):
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def collect(self) -> Iterable[Metric]:
+        engine = self._engine
+        jobs = GaugeMetricFamily("straightpcf_jobs", "Jobs in the store by state.", labels=["state"])
+        for state in STATES:
+            jobs.add_metric([state], engine.counts.get(state, 0))
+        yield jobs
+        for name, text, value in (
+            ("queue_points", "Points that wait or run, as estimated when they came.", engine.load.points),
+            ("spool_bytes", "Bytes of inputs and results that are kept.", engine.load.bytes),
+            ("ready", "1 while a worker is warm and nothing drains.", int(engine.ready)),
+            ("workers", "Workers that are warm.", len(engine.backend.devices)),
+            ("worker_restarts", "Workers that died and were replaced.", engine.backend.restarts),
+        ):
+            yield GaugeMetricFamily(f"straightpcf_{name}", text, value=value)
+
+
+class MetricsMiddleware:
+    """Measure every request; routes, not paths, so that there are few labels."""
+
+    def __init__(self, app: ASGIApp, *, telemetry: Telemetry) -> None:
+        self._app, self._telemetry = app, telemetry
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one request on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        began, status = time.monotonic(), 500
+
+        async def send_and_see(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_and_see)
+        finally:
+            route = getattr(scope.get("route"), "path", "none")
+            self._telemetry.requests.labels(scope["method"], route, status).inc()
+            self._telemetry.seconds.labels(scope["method"], route).observe(time.monotonic() - began)
