@@ -25,6 +25,7 @@ from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
+from straightpcf.service.web import install_page
 
 __all__ = ["create_app", "serve"]
 
@@ -62,6 +63,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     install_error_handlers(app)
     app.include_router(router)
     app.include_router(jobs_router)
+    install_page(app)
     app.add_api_route(
         "/metrics", telemetry.endpoint, include_in_schema=False, dependencies=[Depends(owner_of)], methods=["GET"]
     )

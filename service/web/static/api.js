@@ -1,0 +1,87 @@
+// Requests to the server this page came from, with the key if there is one, and its errors as one class.
+
+const KEY = "straightpcf.key";
+
+export class Problem extends Error {
+  constructor({ status = 0, code = "connection_failed", detail, requestId = "", retryable = false }) {
+    super(detail);
+    Object.assign(this, { status, code, detail, requestId, retryable });
+  }
+}
+
+export function apiKey() {
+  return sessionStorage.getItem(KEY) ?? "";
+}
+
+export function keepApiKey(key) {
+  if (key) sessionStorage.setItem(KEY, key);
+  else sessionStorage.removeItem(KEY);
+}
+
+export function url(path) {
+  return new URL(path, document.baseURI).href;
+}
+
+export async function call(path, { method = "GET", headers = {}, signal } = {}) {
+  let response;
+  try {
+    response = await fetch(url(path), { method, headers: { ...authorization(), ...headers }, signal, cache: "no-store" });
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw unreachable();
+  }
+  if (!response.ok) throw problemFrom(response.status, await response.text(), response.headers.get("X-Request-Id"));
+  return response;
+}
+
+export async function json(path, options) {
+  return (await call(path, options)).json();
+}
+
+// POST a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
+export function upload(path, file, { onProgress, signal }) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open("POST", url(path));
+    for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
+    request.setRequestHeader("Content-Type", "application/octet-stream");
+    request.upload.addEventListener("progress", (event) => onProgress(event.loaded / Math.max(event.total, 1)));
+    request.addEventListener("load", () => {
+      if (request.status < 300) resolve(JSON.parse(request.responseText));
+      else reject(problemFrom(request.status, request.responseText, request.getResponseHeader("X-Request-Id")));
+    });
+    request.addEventListener("error", () => reject(unreachable()));
+    request.addEventListener("abort", () => reject(new DOMException("canceled", "AbortError")));
+    signal.addEventListener("abort", () => request.abort());
+    request.send(file);
+  });
+}
+
+export function pause(milliseconds, signal) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, milliseconds);
+    signal?.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(new DOMException("canceled", "AbortError"));
+    });
+  });
+}
+
+function authorization() {
+  return apiKey() ? { Authorization: `Bearer ${apiKey()}` } : {};
+}
+
+function unreachable() {
+  return new Problem({ detail: "The server does not answer. Is it running, and is the network there?", retryable: true });
+}
+
+function problemFrom(status, text, requestId) {
+  try {
+    const problem = JSON.parse(text);
+    const { detail, title, code = "error", request_id = requestId ?? "", retryable = false } = problem;
+    return new Problem({ status, code, detail: detail ?? title ?? `The server answered ${status}.`, requestId: request_id, retryable });
+  } catch {
+    const retryable = status === 429 || status >= 502;
+    return new Problem({ status, code: "error", detail: `The server answered ${status}.`, requestId: requestId ?? "", retryable });
+  }
+}

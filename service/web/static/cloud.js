@@ -1,0 +1,113 @@
+// The points that are shown: before and after as the GPU takes them, and how far each one moved.
+
+import { strideFor } from "./read/index.js";
+
+export const UNKNOWN = -1e30; // no position after yet
+const SAMPLE = 20_000;
+
+export class Cloud {
+  // before: (3 n) float64 of every stride-th row, or null if only the positions after will be known.
+  constructor({ count, stride = strideFor(count), before = null }) {
+    this.count = count;
+    this.stride = stride;
+    this.shown = Math.ceil(count / stride);
+    this.exact = before;
+    this.origin = before ? centreOf(before) : null;
+    this.known = 0;
+    // (4 n): position relative to the origin, and the measure that is coloured: moved distance, else height.
+    this.after = new Float32Array(4 * this.shown).fill(UNKNOWN);
+    this.before = new Float32Array(3 * this.shown);
+    if (before) this.begin();
+  }
+
+  get hasBefore() {
+    return this.exact !== null;
+  }
+
+  begin() {
+    for (let slot = 0; slot < this.shown; slot++) {
+      for (let axis = 0; axis < 3; axis++) {
+        const value = this.exact[3 * slot + axis] - this.origin[axis];
+        this.before[3 * slot + axis] = value;
+        this.after[4 * slot + axis] = value;
+      }
+    }
+  }
+
+  // rows: (k) of the whole cloud; xyz: (3 k) float64.
+  put(rows, xyz) {
+    for (let item = 0; item < rows.length; item++) {
+      if (rows[item] % this.stride === 0) this.place(rows[item] / this.stride, xyz, 3 * item);
+    }
+  }
+
+  // xyz: (3 n) float64 of every stride-th row, as the reader gives them.
+  putAll(xyz) {
+    for (let slot = 0; slot < this.shown; slot++) this.place(slot, xyz, 3 * slot);
+  }
+
+  place(slot, xyz, at) {
+    if (slot >= this.shown) return;
+    this.origin ??= [xyz[at], xyz[at + 1], xyz[at + 2]];
+    if (this.after[4 * slot + 3] === Math.fround(UNKNOWN)) this.known++;
+    let squared = 0;
+    for (let axis = 0; axis < 3; axis++) {
+      const value = xyz[at + axis];
+      this.after[4 * slot + axis] = value - this.origin[axis];
+      if (this.exact) squared += (value - this.exact[3 * slot + axis]) ** 2;
+      else this.before[3 * slot + axis] = value - this.origin[axis];
+    }
+    this.after[4 * slot + 3] = this.exact ? Math.sqrt(squared) : xyz[at + 2];
+  }
+
+  // The colours' ends: 0 to the 99th percentile of the moved distances; the 1st to the 99th of the heights.
+  range() {
+    const step = Math.max(1, Math.floor(this.shown / SAMPLE));
+    const values = [];
+    for (let slot = 0; slot < this.shown; slot += step) {
+      const value = this.after[4 * slot + 3];
+      if (value > UNKNOWN / 2) values.push(value);
+    }
+    if (values.length === 0) return null;
+    const sorted = Float64Array.from(values).sort();
+    const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))];
+    const low = this.hasBefore ? 0 : at(0.01);
+    return { low, top: Math.max(at(0.99), low + Number.EPSILON) };
+  }
+
+  // Centre and radius of what is there, relative to the origin: a box of the middle 99.8 %, so that strays do not count.
+  bounds() {
+    const source = this.hasBefore ? this.before : this.after;
+    const width = this.hasBefore ? 3 : 4;
+    const step = Math.max(1, Math.floor(this.shown / SAMPLE));
+    const centre = [0, 0, 0];
+    let radius = 0;
+    for (let axis = 0; axis < 3; axis++) {
+      const values = [];
+      for (let slot = 0; slot < this.shown; slot += step) {
+        const value = source[width * slot + axis];
+        if (Number.isFinite(value) && value > UNKNOWN / 2) values.push(value);
+      }
+      if (values.length === 0) return null;
+      const sorted = Float64Array.from(values).sort();
+      const low = sorted[Math.floor(0.001 * sorted.length)];
+      const high = sorted[Math.ceil(0.999 * (sorted.length - 1))];
+      centre[axis] = (low + high) / 2;
+      radius += ((high - low) / 2) ** 2;
+    }
+    return { centre, radius: Math.max(Math.sqrt(radius), 1e-9) };
+  }
+}
+
+// The middle of the box of the finite points: what float32 has to carry stays small.
+function centreOf(xyz) {
+  const low = [Infinity, Infinity, Infinity];
+  const high = [-Infinity, -Infinity, -Infinity];
+  for (let item = 0; item < xyz.length; item++) {
+    const value = xyz[item];
+    const axis = item % 3;
+    if (value < low[axis]) low[axis] = value;
+    if (value > high[axis]) high[axis] = value;
+  }
+  return low.map((value, axis) => (Number.isFinite(value + high[axis]) ? (value + high[axis]) / 2 : 0));
+}

@@ -1,0 +1,79 @@
+// The form: what the server takes, the chosen file, the options as a query.
+
+import { element } from "./report.js";
+import * as text from "./text.js";
+
+export class Form {
+  // parts: the page's elements by id; onFile(file): one was chosen.
+  constructor(parts, onFile) {
+    this.parts = parts;
+    this.file = null;
+    this.info = null;
+    const choose = (file) => {
+      if (!file) return;
+      this.file = file;
+      parts.chosen.textContent = file.name;
+      parts["chosen-note"].textContent = `${text.bytes(file.size)} · choose another or drop it here`;
+      onFile(file);
+    };
+    parts.file.addEventListener("change", () => choose(parts.file.files[0]));
+    parts.strength.addEventListener("input", () => this.showStrength());
+    this.showStrength(); // browsers restore a form's values
+    for (const kind of ["dragenter", "dragover"]) {
+      addEventListener(kind, (event) => {
+        if (!event.dataTransfer?.types.includes("Files")) return;
+        event.preventDefault();
+        parts.drop.classList.add("over");
+      });
+    }
+    addEventListener("dragleave", (event) => {
+      if (!event.relatedTarget) parts.drop.classList.remove("over");
+    });
+    addEventListener("drop", (event) => {
+      event.preventDefault();
+      parts.drop.classList.remove("over");
+      choose(event.dataTransfer.files[0]);
+    });
+  }
+
+  showInfo(info) {
+    this.info = info;
+    const { parts } = this;
+    const suffixes = info.formats.flatMap((format) => format.suffixes);
+    parts.limits.textContent =
+      `${suffixes.map((suffix) => suffix.slice(1)).join(", ")}; up to ${text.bytes(info.max_bytes)} and ${text.plural(info.max_points, "point")}.`;
+    parts.file.accept = suffixes.join(",");
+    parts.server.textContent = [`version ${info.version}`, info.devices.join(", ")].filter(Boolean).join(" · ");
+    fill(parts.iterations, Array.from({ length: info.max_iterations }, (_, pass) => [String(pass + 1), String(pass + 1)]));
+    fill(parts.format, info.formats.map((format) => [format.name, format.name.toUpperCase()]));
+  }
+
+  // What is wrong before anything is sent, or "".
+  fault() {
+    if (!this.file) return "Choose a file first.";
+    if (this.file.size === 0) return `${this.file.name} is empty.`;
+    if (this.info && this.file.size > this.info.max_bytes) {
+      return `${this.file.name} has ${text.bytes(this.file.size)}; this server takes ${text.bytes(this.info.max_bytes)}.`;
+    }
+    return "";
+  }
+
+  query() {
+    const { iterations, strength, seed, normals, format } = this.parts;
+    const query = new URLSearchParams({
+      filename: this.file.name, iterations: iterations.value, strength: strength.value, seed: seed.value, normals: normals.value,
+    });
+    if (format.value) query.set("format", format.value);
+    return query;
+  }
+
+  showStrength() {
+    this.parts["strength-value"].textContent = `${Math.round(100 * this.parts.strength.value)} %`;
+  }
+}
+
+function fill(select, options) {
+  const { value } = select;
+  select.replaceChildren(select.options[0], ...options.map(([name, label]) => element("option", label, { value: name })));
+  select.value = [...select.options].some((option) => option.value === value) ? value : select.options[0].value;
+}

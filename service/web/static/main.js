@@ -1,0 +1,218 @@
+// The page: a file and options go out as a job; its words, points and result come back.
+
+import { Problem, call, json, keepApiKey, upload } from "./api.js";
+import { Cloud } from "./cloud.js";
+import { followJob, thinning } from "./follow.js";
+import { Form } from "./form.js";
+import { rememberJob, showJobs } from "./jobs.js";
+import { canRead, readFile } from "./read/reader.js";
+import { suffixOf } from "./read/index.js";
+import { offerDownload, showReport } from "./report.js";
+import { Stage } from "./stage.js";
+import * as text from "./text.js";
+
+const parts = Object.fromEntries([...document.querySelectorAll("[id]")].map((part) => [part.id, part]));
+const stage = new Stage(parts);
+const form = new Form(parts, chosen);
+const files = new Map(); // the file of each job that was sent since the page was loaded
+let reading = Promise.resolve(null); // {count, stride, xyz} of the chosen file, or null
+let run = null; // {id, abort} while a job is sent or followed
+
+parts.form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  send().catch(showProblem);
+});
+parts.cancel.addEventListener("click", () => cancel().catch(showProblem));
+parts.key.addEventListener("change", () => {
+  keepApiKey(parts.key.value.trim());
+  begin();
+});
+parts["jobs-refresh"].addEventListener("click", listJobs);
+begin();
+
+function begin() {
+  json("v1/info").then((info) => form.showInfo(info)).catch(showProblem);
+  listJobs();
+}
+
+function chosen(file) {
+  parts.error.hidden = true;
+  if (run) return; // what is on the stage is the running job's
+  reading = read(file);
+  reading.then((before) => {
+    if (form.file === file && !run) showBefore(file, before);
+  });
+}
+
+// Return {count, stride, xyz, fault}, or {fault} where the page cannot read the file.
+async function read(file) {
+  if (!canRead(file.name, file.size)) {
+    return { fault: `This page does not read ${suffixOf(file.name) || "such"} files of ${text.bytes(file.size)}: only the result will be shown.` };
+  }
+  stage.note("Reading…");
+  try {
+    return await readFile(file, file.name);
+  } catch (error) {
+    return { fault: `This page could not read ${file.name} (${error.message}): only the result will be shown.` };
+  }
+}
+
+function showBefore(file, before) {
+  parts.report.hidden = parts.progress.hidden = true;
+  if (!before.xyz || before.count === 0) {
+    stage.show(null, before.fault ?? `${file.name} has no points.`);
+    return;
+  }
+  const cloud = new Cloud({ count: before.count, stride: before.stride, before: before.xyz });
+  stage.show(cloud, `${file.name}: ${text.plural(cloud.count, "point")}. ${thinning(cloud)}`);
+}
+
+async function send() {
+  parts.error.hidden = true;
+  keepApiKey(parts.key.value.trim());
+  const fault = form.fault();
+  if (fault) {
+    showProblem(new Problem({ code: "", detail: fault }));
+    parts.file.focus();
+    return;
+  }
+  const { file } = form;
+  const abort = new AbortController();
+  const mine = (run = { id: null, abort });
+  busy(true);
+  say("Sending", 0);
+  try {
+    const onProgress = (share) => say(`Sending, ${Math.round(100 * share)} %`, share);
+    const job = await upload(`jobs?${form.query()}`, file, { onProgress, signal: abort.signal });
+    mine.id = job.id;
+    files.set(job.id, file);
+    rememberJob(job.id);
+    listJobs();
+    await follow(job.id, await reading, abort.signal);
+  } catch (error) {
+    if (run === mine) parts.progress.hidden = true;
+    if (!abort.signal.aborted) throw error;
+    if (run === mine) speak("Canceled");
+  } finally {
+    done(mine);
+  }
+}
+
+async function follow(id, before, signal) {
+  parts.report.hidden = true;
+  let note = before?.xyz ? "" : before?.fault ?? "";
+  if (!before?.xyz) stage.show(null, note);
+  const hooks = {
+    onEvent: showEvent,
+    onCloud: (cloud, line) => stage.show(cloud, (note = line)),
+    onNote: (line) => stage.note(line),
+    onPoints: (how) => stage.refresh(how),
+  };
+  const job = await followJob(id, { before: before?.xyz ? before : null, hooks, signal });
+  if (job.state === "succeeded") {
+    say("Done", 1, { aloud: true });
+    showReport(job, parts);
+    offerDownload(parts.download, job, showProblem);
+    parts.report.hidden = false;
+    parts["report-title"].focus({ preventScroll: true });
+  } else {
+    parts.progress.hidden = true;
+    if (job.state === "canceled") speak("Canceled");
+    if (job.error) showProblem(new Problem({ ...job.error, requestId: "" }));
+    else stage.note(job.state === "canceled" ? "The job was canceled." : `The job is ${job.state}.`);
+  }
+}
+
+// Follow a job of the list; one that runs here is left to run on the server.
+async function showJob(job) {
+  run?.abort.abort();
+  parts.error.hidden = true;
+  const abort = new AbortController();
+  const mine = (run = { id: job.id, abort });
+  busy(true);
+  try {
+    const file = files.get(job.id);
+    reading = file ? read(file) : Promise.resolve({ fault: "" });
+    await follow(job.id, await reading, abort.signal);
+  } catch (error) {
+    if (!abort.signal.aborted) throw error;
+  } finally {
+    done(mine);
+  }
+}
+
+function done(mine) {
+  if (run === mine) {
+    run = null;
+    busy(false);
+  }
+  listJobs();
+}
+
+async function cancel() {
+  if (!run) return;
+  if (run.id === null) run.abort.abort();
+  else await call(`jobs/${encodeURIComponent(run.id)}/cancel`, { method: "POST" });
+}
+
+function listJobs() {
+  showJobs({ section: parts.jobs, list: parts["jobs-list"], onShow: showJob, onProblem: showProblem }).catch(showProblem);
+}
+
+function showEvent(kind, data) {
+  if (kind === "queued") {
+    const line = data.position ? `Waiting: ${text.plural(data.position, "job")} before this one` : "Waiting";
+    say(line, null, { aloud: true });
+  } else if (kind === "start") {
+    say(`Started${data.device ? ` on ${data.device}` : ""}`, 0, { aloud: true });
+  } else if (kind === "progress") {
+    say(`Pass ${data.iteration}, ${Math.round(100 * data.progress)} %`, data.progress, { aloud: isQuarter(data.progress) });
+  } else if (kind === "log") {
+    stage.note(data.message);
+  } else if (kind === "reconnecting") {
+    say("The connection is lost; trying again", null, { aloud: true });
+  }
+}
+
+let quarter = 0;
+
+// True where another quarter of the way is done: often enough to be read out.
+function isQuarter(progress) {
+  const now = Math.floor(4 * progress);
+  const isNew = now !== quarter;
+  quarter = now;
+  return isNew;
+}
+
+// share: 0..1, or null while nobody knows.
+function say(line, share, { aloud = false } = {}) {
+  parts.progress.hidden = false;
+  parts.status.textContent = line;
+  if (share === null) parts.bar.removeAttribute("value");
+  else parts.bar.value = share;
+  if (aloud) speak(line);
+}
+
+function speak(line) {
+  parts.spoken.textContent = line;
+}
+
+function busy(isBusy) {
+  parts.submit.disabled = isBusy;
+  parts.cancel.hidden = !isBusy;
+}
+
+function showProblem(problem) {
+  if (!(problem instanceof Problem)) console.error(problem);
+  if (problem.status === 401) {
+    parts["key-row"].hidden = false;
+    parts.key.focus();
+  }
+  const lines = [document.createElement("strong"), document.createElement("p")];
+  lines[0].textContent = problem.detail ?? "The page met an error of its own.";
+  const marks = [problem.code, problem.requestId && `request ${problem.requestId}`, problem.retryable && "worth another try"];
+  lines[1].textContent = marks.filter(Boolean).join(" · ");
+  lines[1].className = "quiet";
+  parts.error.replaceChildren(...lines);
+  parts.error.hidden = false;
+}

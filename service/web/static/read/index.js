@@ -1,0 +1,39 @@
+// Which files this page can read by itself; all others go to the server unseen.
+
+import { readNpy } from "./npy.js";
+import { readPly } from "./ply.js";
+import { readXyz } from "./xyz.js";
+
+export const READABLE = [".ply", ".npy", ".xyz", ".txt", ".asc", ".csv", ".pts"];
+export const MAX_READ_BYTES = 1 << 30;
+export const MAX_SHOWN = 2_000_000;
+
+const TEXT = [".xyz", ".txt", ".asc", ".csv", ".pts"];
+
+export function suffixOf(name) {
+  return name.includes(".") ? name.slice(name.lastIndexOf(".")).toLowerCase() : "";
+}
+
+// Return (3 N) positions; a file is what its first bytes say, as on the server.
+export function readPositions(bytes, name) {
+  if (bytes[0] === 0x93 && bytes[1] === 0x4e && bytes[2] === 0x55) return readNpy(bytes);
+  if (bytes[0] === 0x70 && bytes[1] === 0x6c && bytes[2] === 0x79 && bytes[3] <= 32) return readPly(bytes);
+  if (TEXT.includes(suffixOf(name))) return readXyz(bytes);
+  throw new Error("a format that this page does not read");
+}
+
+export function strideFor(count) {
+  return Math.max(1, Math.ceil(count / MAX_SHOWN));
+}
+
+// Keep every stride-th row.
+export function thinned(xyz, stride) {
+  if (stride === 1) return xyz.slice();
+  const kept = new Float64Array(3 * Math.ceil(xyz.length / 3 / stride));
+  for (let row = 0, at = 0; at < kept.length; row += stride, at += 3) {
+    kept[at] = xyz[3 * row];
+    kept[at + 1] = xyz[3 * row + 1];
+    kept[at + 2] = xyz[3 * row + 2];
+  }
+  return kept;
+}
