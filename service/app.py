@@ -17,6 +17,7 @@ from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
 from straightpcf.service.api.jobs import router as jobs_router
+from straightpcf.service.api.openapi import document_problems
 from straightpcf.service.api.request_id import RequestIdMiddleware
 from straightpcf.service.api.rest import router
 from straightpcf.service.backends.base import Backend
@@ -64,6 +65,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.include_router(router)
     app.include_router(jobs_router)
     install_page(app)
+    document_problems(app)
     app.add_api_route(
         "/metrics", telemetry.endpoint, include_in_schema=False, dependencies=[Depends(owner_of)], methods=["GET"]
     )

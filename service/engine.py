@@ -113,13 +113,17 @@ class Engine:
 
     # --- taking jobs
 
-    def check_room(self, *, size: int = 0) -> None:
+    async def check_room(self, *, size: int = 0) -> None:
         """Raise what would keep a job of `size` bytes from being admitted, as far as it is known before its body."""
-        if self.backend.failure is not None:
-            raise self.backend.failure
         if self.draining:
             raise ServerBusy("the server is shutting down")
+        await self._check(size)
+
+    async def _check(self, size: int) -> None:
+        if self.backend.failure is not None:
+            raise self.backend.failure
         self.limits.check_bytes(size)
+        self.load = await self._call(JobStore.load)
         self.limits.check_queue(self.load)
         self.limits.check_disk(self.load, self._folders.free_bytes(), size=size)
 
@@ -133,7 +137,7 @@ class Engine:
         Raises ServerBusy, SpoolFull, QuotaExceeded, TooManyBytes, UnknownFormat, IdConflict, IdempotencyConflict.
         """
         size = source.stat().st_size
-        self.check_room(size=size)
+        await self._check(size)  # not whether it drains: what was let in before may finish
         if request.format is not None:
             format_named(request.format)  # raises before anything waits
         if request.id is not None and not _ID.fullmatch(request.id):

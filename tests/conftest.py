@@ -10,7 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +45,8 @@ class RunningServer:
         raise AssertionError(f"not ready within {START_SECONDS} s:\n{self.log.read_text()}")
 
     def spooled_files(self) -> list[Path]:
-        return [path for path in self.data_dir.rglob("*") if path.is_file() and path.name != ".lock"]
+        folders = (self.data_dir / "jobs", self.data_dir / "incoming")
+        return [path for folder in folders for path in folder.rglob("*") if path.is_file()]
 
     def _status(self, path: str) -> int:
         try:
@@ -57,13 +58,14 @@ class RunningServer:
 
 
 @contextmanager
-def run_server(folder: Path, *arguments: str) -> Iterator[RunningServer]:
+def run_server(folder: Path, *arguments: str, environment: Mapping[str, str] | None = None) -> Iterator[RunningServer]:
     """Start a server, wait until it listens, and end it politely."""
     log = folder / "server.log"
     command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--device", "cpu"]
     command += ["--data-dir", str(folder / "data"), *arguments]
     with log.open("wb") as sink:
-        process = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env=clean_environment())
+        settings = clean_environment() | dict(environment or {})
+        process = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env=settings)
     try:
         yield RunningServer(url=_url_in(log, process), process=process, log=log, data_dir=folder / "data")
     finally:

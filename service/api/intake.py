@@ -27,7 +27,7 @@ async def take_job(
 ) -> tuple[JobRecord, bool, Mapping[str, str]]:
     """Receive the body and commit the job; return it, whether it is new, and every field that came with it."""
     engine: Engine = request.app.state.engine
-    engine.check_room(size=declared_size(request))
+    await engine.check_room(size=declared_size(request))
     key = _idempotency_key(request)
     _parse_fields(request.query_params, more_fields)  # before the body, so that it need not be read
     with engine.upload() as source:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from fastapi import FastAPI
+
 from straightpcf.points.formats import FORMATS
 from straightpcf.points.options import MAX_ITERATIONS
 from straightpcf.service.api.schemas import Problem
@@ -20,6 +22,7 @@ __all__ = [
     "QUERY_PARAMETERS",
     "RESULT_RESPONSES",
     "STREAM_RESPONSES",
+    "document_problems",
     "problems",
 ]
 
@@ -160,6 +163,18 @@ _PROBLEMS = {
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe problems by status."""
     return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 422, 429})}
+
+
+def document_problems(app: FastAPI) -> None:
+    """Put the schema that every problem refers to into the app's OpenAPI document."""
+    plain = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = plain()
+        document["components"]["schemas"][Problem.__name__] = Problem.model_json_schema()
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]
 
 
 _INTAKE = (400, 401, 409, 413, 415, 422, 429, 500, 503, 507)

@@ -128,7 +128,8 @@ class _Preview:
 
 def _displacement(before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]) -> dict[str, float]:
     with np.errstate(invalid="ignore"):
-        moved = np.linalg.norm(after - before, axis=1)
+        x, y, z = (after - before).T
+        moved = np.hypot(np.hypot(x, y), z)  # squares of huge coordinates overflow
     moved = moved[np.isfinite(moved)]
     p50, p90, p99, most = (float(value) for value in np.percentile(moved, [50, 90, 99, 100]))
     return {"p50": p50, "p90": p90, "p99": p99, "max": most, "mean": float(moved.mean())}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -25,7 +27,7 @@ def test_any_chunking_gives_the_same_frames(cuts: list[int]) -> None:
     data, reader = stream(), PatchReader()
     edges = [0, *sorted(cuts), len(data)]
     frames: list[PatchFrame] = []
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in itertools.pairwise(edges):
         frames += reader.feed(data[a:b])
     assert reader.points == 10
     assert [(len(f.indices), f.iteration, f.final, f.end) for f in frames] == [

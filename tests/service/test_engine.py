@@ -1,179 +1,293 @@
-"""The engine against a backend that does as it is told."""
+"""The engine against a backend that does as it is told, with a real store on a real disk."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from straightpcf.points.errors import (
     DeviceUnavailable,
+    IdConflict,
+    IdempotencyConflict,
+    InternalError,
+    InvalidRequest,
     JobCanceled,
+    JobNotFinished,
     MalformedFile,
+    NotFound,
+    QuotaExceeded,
     ServerBusy,
+    SpoolFull,
     StraightPCFError,
     TooManyBytes,
     UnknownFormat,
 )
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.backends.base import FileJob, FileReport
-from straightpcf.service.engine import Engine, Job, Limits
+from straightpcf.service.admission import Limits
+from straightpcf.service.backends.base import WorkerDied
+from straightpcf.service.engine import Engine, JobRequest
+from straightpcf.service.jobs.record import JobRecord
+from tests.service.fakes import CONTENT, ObedientBackend
 
-REPORT = FileReport(format="npy", points=1, untouched=0, iterations=1, noise_before=0.0, noise_after=0.0, seconds=0.0)
-
-
-class ObedientBackend:
-    """Start every job once `go` is set and end it, with `error` or well, once `finish` is set."""
-
-    def __init__(self) -> None:
-        self.devices: tuple[str, ...] = ("cpu",)
-        self.failure: StraightPCFError | None = None
-        self.error: StraightPCFError | None = None
-        self.go, self.finish = asyncio.Event(), asyncio.Event()
-        self.canceled: list[str] = []
-
-    async def start(self) -> None:
-        pass
-
-    async def stop(self) -> None:
-        pass
-
-    async def run(
-        self, job: FileJob, *, on_start: Callable[[], None], on_progress: Callable[[float], None]
-    ) -> FileReport:
-        try:
-            await self.go.wait()
-            on_start()
-            on_progress(0.5)
-            on_progress(0.501)  # too little to tell
-            await self.finish.wait()
-        except asyncio.CancelledError:
-            self.canceled.append(job.id)
-            raise
-        if self.error is not None:
-            raise self.error
-        return REPORT
+Scenario = Callable[[Engine, ObedientBackend], Coroutine[Any, Any, None]]
 
 
-@pytest.fixture
-def cloud(tmp_path: Path) -> Path:
-    path = tmp_path / "cloud"
-    path.write_bytes(b"0 0 0\n")
-    return path
+@asynccontextmanager
+async def running(folder: Path, backend: ObedientBackend, **limits: Any) -> AsyncIterator[Engine]:
+    engine = Engine(
+        backend,
+        limits=Limits(**{"max_bytes": 100, "max_points": 10, "shutdown_seconds": 0.0} | limits),
+        data_dir=folder,
+    )
+    await engine.start()
+    try:
+        yield engine
+    finally:
+        await engine.stop()
 
 
-def engine_of(backend: ObedientBackend, *, max_jobs: int = 2, max_wait_seconds: float = 10.0) -> Engine:
-    limits = Limits(max_bytes=100, max_points=10, max_jobs=max_jobs, max_wait_seconds=max_wait_seconds)
-    return Engine(backend, limits=limits)
+async def submit(engine: Engine, content: bytes = b"0 0 0\n", **request: Any) -> tuple[JobRecord, bool]:
+    with engine.upload() as path:
+        path.write_bytes(content)
+        return await engine.submit(path, JobRequest(**{"options": DenoiseOptions()} | request))
 
 
-def submit(engine: Engine, cloud: Path, *, format: str | None = None) -> Job:
-    return engine.submit(cloud, cloud.with_name("result"), options=DenoiseOptions(), format=format)
+def play(folder: Path, scenario: Scenario, *outcomes: StraightPCFError | WorkerDied, **limits: Any) -> None:
+    async def scene() -> None:
+        backend = ObedientBackend(*outcomes)
+        async with running(folder, backend, **limits) as engine:
+            await asyncio.wait_for(scenario(engine, backend), timeout=20)
+
+    asyncio.run(scene())
 
 
-def test_a_job_tells_its_events_in_order_to_those_who_come_early_and_late(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
-        job = submit(engine_of(backend), cloud)
-        early = asyncio.create_task(_kinds(job))
-        await asyncio.sleep(0)
-        backend.go.set()
-        await asyncio.sleep(0)
-        backend.finish.set()
-        assert await job.result() == REPORT
-        assert await early == await _kinds(job) == ["queued", "start", "progress", "completed"]
-
-    asyncio.run(scenario())
+async def kinds(engine: Engine, id: str, after: int = 0) -> list[str]:
+    return [event.kind async for event in engine.events(id, after=after)]
 
 
-async def _kinds(job: Job) -> list[str]:
-    return [event.kind async for event in job.events()]
-
-
-def test_a_full_engine_refuses_at_once_and_admits_again_when_a_job_ends(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
-        backend.go.set()
-        engine = engine_of(backend, max_jobs=1)
-        job = submit(engine, cloud)
-        with pytest.raises(ServerBusy, match="holds 1"):
-            submit(engine, cloud)
-        backend.finish.set()
-        await job.result()
-        await submit(engine, cloud).result()
-
-    asyncio.run(scenario())
-
-
-def test_a_job_that_no_worker_takes_in_time_is_answered_busy(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
-        with pytest.raises(ServerBusy, match=r"0\.01 s"):
-            await submit(engine_of(backend, max_wait_seconds=0.01), cloud).result()
-        assert len(backend.canceled) == 1
-
-    asyncio.run(scenario())
-
-
-def test_a_job_that_has_started_may_take_longer_than_the_longest_wait(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
-        backend.go.set()
-        job = submit(engine_of(backend, max_wait_seconds=0.01), cloud)
-        await asyncio.sleep(0.05)
-        backend.finish.set()
-        assert await job.result() == REPORT
-
-    asyncio.run(scenario())
-
-
-def test_cancel_reaches_the_backend_and_ends_the_events(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
-        backend.go.set()
-        job = submit(engine_of(backend), cloud)
-        events = asyncio.create_task(_kinds(job))
-        await asyncio.sleep(0)
-        await job.cancel()
-        assert backend.canceled == [job.id]
-        assert "completed" not in await events
-        with pytest.raises(JobCanceled, match=job.id):
-            await job.result()
-
-    asyncio.run(scenario())
-
-
-def test_the_error_of_a_job_is_raised_as_it_is(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
+def test_a_job_tells_its_events_in_order_to_those_who_come_early_late_or_again(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, created = await submit(engine)
+        assert (created, record.state, record.position) == (True, "queued", 0)
+        early = asyncio.create_task(kinds(engine, record.id))
         backend.go.set()
         backend.finish.set()
-        backend.error = MalformedFile("line 3")
-        with pytest.raises(MalformedFile, match="line 3"):
-            await submit(engine_of(backend), cloud).result()
+        assert (await engine.wait(record.id)).state == "succeeded"
+        whole = ["queued", "start", "progress", "log", "output", "completed"]
+        assert await early == await kinds(engine, record.id) == whole
+        assert await kinds(engine, record.id, after=3) == whole[3:]
 
-    asyncio.run(scenario())
+    play(tmp_path, scenario)
 
 
-def test_limits_and_names_are_checked_before_anything_waits(cloud: Path) -> None:
-    async def scenario() -> None:
-        engine = engine_of(ObedientBackend())
+def test_a_result_is_there_when_the_job_has_succeeded_and_not_before(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine, name="scan.xyz")
+        with pytest.raises(JobNotFinished):
+            await engine.result(record.id)
+        backend.go.set()
+        backend.finish.set()
+        await engine.wait(record.id)
+        path, record = await engine.result(record.id)
+        assert path.read_bytes() == CONTENT
+        assert record.result is not None
+        assert record.result.filename == "scan_clean.xyz"
+        assert record.report is not None
+        assert record.report["noise_before"] is None  # JSON has no NaN
+
+    play(tmp_path, scenario)
+
+
+def test_what_a_server_leaves_the_next_one_does(tmp_path: Path) -> None:
+    ids: list[str] = []
+
+    async def leave(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        ids.extend([(await submit(engine, bytes([65 + n])))[0].id for n in range(3)])
+        while not backend.runs:
+            await asyncio.sleep(0.01)
+
+    async def finish(engine: Engine, backend: ObedientBackend) -> None:
+        assert [(await engine.get(id)).state for id in ids] == ["queued"] * 3
+        backend.go.set()
+        backend.finish.set()
+        assert [(await engine.wait(id)).state for id in ids] == ["succeeded"] * 3
+
+    play(tmp_path, leave)
+    play(tmp_path, finish)
+
+
+def test_a_worker_that_dies_costs_an_attempt_and_the_third_one_is_the_last(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        first, second = (await submit(engine))[0], (await submit(engine, b"1 1 1\n"))[0]
+        record = await engine.wait(first.id)
+        assert (record.state, record.attempts) == ("failed", 3)
+        assert isinstance(record.error, InternalError)
+        assert (await engine.wait(second.id)).attempts == 2  # it lost one worker and went on
+        assert len({job.target for job in backend.runs}) == len(backend.runs)
+
+    play(tmp_path, scenario, *[WorkerDied("killed")] * 4)
+
+
+def test_the_same_idempotency_key_finds_the_same_job_and_another_request_is_a_conflict(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        made = await asyncio.gather(*(submit(engine, idempotency_key="k") for _ in range(8)))
+        assert len({record.id for record, _ in made}) == 1
+        assert sum(created for _, created in made) == 1
+        for change in ({"content": b"1 1 1\n"}, {"options": DenoiseOptions(seed=1)}, {"endpoint": "denoise"}):
+            with pytest.raises(IdempotencyConflict):
+                await submit(engine, idempotency_key="k", **change)
+        assert (await submit(engine, idempotency_key="k", owner="another"))[1]
+        assert len(list((tmp_path / "jobs").iterdir())) == 2  # no repetition left a folder
+
+    play(tmp_path, scenario)
+
+
+def test_a_chosen_id_makes_one_job_and_must_be_a_plain_name(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        assert (await submit(engine, id="scan-1"))[0].id == "scan-1"
+        assert not (await submit(engine, id="scan-1"))[1]
+        with pytest.raises(IdConflict):
+            await submit(engine, b"1 1 1\n", id="scan-1")
+        with pytest.raises(IdConflict):
+            await submit(engine, id="scan-1", owner="another")
+        for id in ("", "..", ".x", "a/b", "a" * 65, "ü", "a b"):
+            with pytest.raises(InvalidRequest):
+                await submit(engine, id=id)
+
+    play(tmp_path, scenario)
+
+
+def test_canceling_works_in_every_state_and_reaches_the_worker(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        waiting, _ = await submit(engine)
+        assert (await engine.cancel(waiting.id)).state == "canceled"
+        backend.go.set()
+        running_, _ = await submit(engine)
+        while not backend.runs:
+            await asyncio.sleep(0.01)
+        assert (await engine.cancel(running_.id)).state == "canceled"
+        assert backend.canceled == [running_.id]
+        with pytest.raises(JobCanceled):
+            await engine.result(running_.id)
+        backend.finish.set()
+        done, _ = await submit(engine)
+        await engine.wait(done.id)
+        assert (await engine.cancel(done.id)).state == "succeeded"
+        assert (await kinds(engine, waiting.id))[-1] == "completed"
+
+    play(tmp_path, scenario)
+
+
+def test_a_deleted_job_leaves_no_file_and_no_row(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        record, _ = await submit(engine)
+        while not backend.runs:
+            await asyncio.sleep(0.01)
+        await engine.delete(record.id)
+        with pytest.raises(NotFound):
+            await engine.get(record.id)
+        assert not list((tmp_path / "jobs").iterdir())
+
+    play(tmp_path, scenario)
+
+
+def test_a_job_of_another_owner_does_not_exist(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine, owner="a")
+        for ask in (engine.get, engine.cancel, engine.delete, engine.result, engine.wait):
+            with pytest.raises(NotFound):
+                await ask(record.id, owner="b")
+        assert await engine.list(owner="b") == ([], None)
+        assert [job.id for job in (await engine.list(owner="a"))[0]] == [record.id]
+
+    play(tmp_path, scenario)
+
+
+def test_pages_list_every_job_once_newest_first(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        ids = [(await submit(engine, bytes([65 + n])))[0].id for n in range(7)]
+        await engine.cancel(ids[2])
+        seen, cursor = [], None
+        while True:
+            page, cursor = await engine.list(limit=3, cursor=cursor)
+            seen += [record.id for record in page]
+            if cursor is None:
+                break
+        assert seen == ids[::-1]
+        assert [record.id for record in (await engine.list(states=["canceled"]))[0]] == [ids[2]]
+        with pytest.raises(InvalidRequest, match="cursor"):
+            await engine.list(cursor="nonsense")
+
+    play(tmp_path, scenario)
+
+
+def test_what_is_over_a_limit_is_refused_and_costs_nothing(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         with pytest.raises(UnknownFormat):
-            submit(engine, cloud, format="no-such-format")
-        cloud.write_bytes(b"x" * 101)
+            await submit(engine, format="no-such-format")
         with pytest.raises(TooManyBytes, match="100"):
-            submit(engine, cloud)
+            await submit(engine, b"x" * 101)
+        first, _ = await submit(engine, owner="a")
+        with pytest.raises(QuotaExceeded):
+            await submit(engine, b"1 1 1\n", owner="a")
+        await submit(engine, owner="b")
+        with pytest.raises(ServerBusy, match="holds 2"):
+            await submit(engine, owner="c")
+        await engine.cancel(first.id, owner="a")
+        await submit(engine, owner="c")
+        assert len(list((tmp_path / "jobs").iterdir())) == 3
+        assert not list((tmp_path / "incoming").iterdir())
 
-    asyncio.run(scenario())
+    play(tmp_path, scenario, max_jobs=2, max_jobs_per_key=1)
 
 
-def test_a_backend_that_can_never_start_says_why_to_every_job(cloud: Path) -> None:
-    async def scenario() -> None:
-        backend = ObedientBackend()
+def test_a_full_disk_is_said_before_anything_is_written(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        with pytest.raises(SpoolFull):
+            await submit(engine, b"x" * 60)
+        await submit(engine, b"0 0 0\n")
+
+    play(tmp_path, scenario, max_spool_bytes=100)
+
+
+def test_finished_jobs_expire_and_are_then_forgotten(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        record, _ = await submit(engine)
+        await engine.wait(record.id)
+        await engine._sweep()
+        assert (await engine.get(record.id)).state == "expired"
+        assert not list((tmp_path / "jobs").iterdir())
+
+    play(tmp_path, scenario, result_ttl_seconds=1e-6)
+
+
+def test_the_error_of_a_job_is_raised_as_it_is(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        record, _ = await submit(engine)
+        assert (await engine.wait(record.id)).state == "failed"
+        with pytest.raises(MalformedFile, match="line 3"):
+            await engine.result(record.id)
+
+    play(tmp_path, scenario, MalformedFile("line 3"))
+
+
+def test_a_backend_that_can_never_start_says_why_to_every_job(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         backend.failure = DeviceUnavailable("no cuda")
         with pytest.raises(DeviceUnavailable):
-            submit(engine_of(backend), cloud)
+            await submit(engine)
 
-    asyncio.run(scenario())
+    play(tmp_path, scenario)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from straightpcf.points.errors import DeviceUnavailable, InternalError, StraightPCFError
+from straightpcf.points.errors import DeviceUnavailable, StraightPCFError
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends import local
-from straightpcf.service.backends.base import FileJob, FileReport
+from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
 from straightpcf.service.backends.local import LocalBackend
-from straightpcf.service.backends.process import WorkerDied
 from straightpcf.service.backends.worker import WorkerSpec
+from tests.service.fakes import REPORT, Deaf
 
 SPEC = WorkerSpec(device="cpu", weights=None, threads=None)
 JOB = FileJob(id="1", source=Path("in"), target=Path("out"), options=DenoiseOptions(), max_points=10)
-REPORT = FileReport(format="npy", points=1, untouched=0, iterations=1, noise_before=0.0, noise_after=0.0, seconds=0.0)
 
 
 class Workers:
@@ -47,7 +45,7 @@ class Worker:
     def alive(self) -> bool:
         return not self.died.done()
 
-    async def run(self, job: FileJob, *, on_progress: Callable[[float], None]) -> FileReport:
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
         await asyncio.sleep(0)
         if self.owner.deaths == 0:
             return REPORT
@@ -64,7 +62,7 @@ def run(backend: LocalBackend, jobs: int = 1) -> list[FileReport]:
     async def scenario() -> list[FileReport]:
         await backend.start()
         try:
-            many = (backend.run(JOB, on_start=lambda: None, on_progress=lambda _: None) for _ in range(jobs))
+            many = (backend.run(JOB, Deaf()) for _ in range(jobs))
             return await asyncio.wait_for(asyncio.gather(*many), timeout=5)
         finally:
             await backend.stop()
@@ -72,19 +70,19 @@ def run(backend: LocalBackend, jobs: int = 1) -> list[FileReport]:
     return asyncio.run(scenario())
 
 
-def test_a_job_whose_worker_dies_once_is_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_dies_is_told_and_the_next_job_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
-    assert run(LocalBackend([SPEC])) == [REPORT]
-    assert workers.started == 2
 
+    async def scenario() -> None:
+        backend = LocalBackend([SPEC])
+        await backend.start()
+        with pytest.raises(WorkerDied):
+            await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5)
+        assert await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5) == REPORT
+        assert (workers.started, backend.restarts) == (2, 1)
+        await backend.stop()
 
-def test_a_job_that_kills_two_workers_is_given_up_and_the_next_one_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=2))
-    backend = LocalBackend([SPEC])
-    with pytest.raises(InternalError, match="2 times"):
-        run(backend)
-    assert run(LocalBackend([SPEC])) == [REPORT]
-    assert workers.deaths == 0
+    asyncio.run(scenario())
 
 
 def test_many_jobs_share_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ def test_every_setting_is_read_from_the_environment() -> None:
     environment = {
         "STRAIGHTPCF_PORT": "9000",
         "STRAIGHTPCF_DATA_DIR": "/data",
-        "STRAIGHTPCF_MAX_WAIT_SECONDS": "1.5",
+        "STRAIGHTPCF_MAX_SYNC_SECONDS": "1.5",
         "STRAIGHTPCF_THREADS": "3",
         "STRAIGHTPCF_WEIGHTS": "w.safetensors",
         "STRAIGHTPCF_DEVICE": "cpu",
@@ -22,7 +22,7 @@ def test_every_setting_is_read_from_the_environment() -> None:
     assert settings == Settings(
         port=9000,
         data_dir=Path("/data"),
-        max_wait_seconds=1.5,
+        max_sync_seconds=1.5,
         threads=3,
         weights=Path("w.safetensors"),
         device="cpu",

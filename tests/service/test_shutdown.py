@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
+import json
 import signal
 import subprocess
 import time
+import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tests.clouds import noisy, torus
-from tests.conftest import RunningServer, run_server
+from tests.conftest import run_server
 
 
 def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Path) -> None:
@@ -20,39 +23,42 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         # The request comes before the worker is warm: it waits for it.
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=1"]
         request = subprocess.Popen(command, stdout=subprocess.PIPE)
-        _wait_for_spooled(server)
+        _wait_for(server.spooled_files)
         worker = server.worker_pid()
         server.process.send_signal(signal.SIGTERM)
         body, _ = request.communicate(timeout=60)
         assert np.load(io.BytesIO(body)).shape == (400, 3)
         server.process.wait(timeout=20)
         assert not _runs(worker)
-        assert not list(server.data_dir.iterdir())
+        assert not server.spooled_files()
         assert "Traceback" not in server.log.read_text()
 
 
-def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_sweeps_the_spool(tmp_path: Path) -> None:
+def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(tmp_path: Path) -> None:
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(30_000), 0.01))
     with run_server(tmp_path) as server:
         server.wait_until_ready()
         worker = server.worker_pid()
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=3"]
         request = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        _wait_for_spooled(server)
+        _wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
         server.process.kill()
         assert request.wait(timeout=20) != 0
         deadline = time.monotonic() + 20
         while _runs(worker):
             assert time.monotonic() < deadline, "the worker outlives its server"
             time.sleep(0.05)
-        assert server.spooled_files()
     with run_server(tmp_path) as server:
+        with urllib.request.urlopen(f"{server.url}/jobs") as answer:
+            (job,) = json.load(answer)["jobs"]
+        assert job["state"] in ("queued", "starting", "processing")
+        subprocess.run(["curl", "-s", "-X", "DELETE", f"{server.url}/jobs/{job['id']}"], check=True)
         assert not server.spooled_files()
 
 
-def _wait_for_spooled(server: RunningServer) -> None:
+def _wait_for(look: Callable[[], object]) -> None:
     deadline = time.monotonic() + 20
-    while not server.spooled_files():
+    while not look():
         assert time.monotonic() < deadline
         time.sleep(0.01)
 

@@ -75,21 +75,24 @@ export class Cloud {
     return { low, top: Math.max(at(0.99), low + Number.EPSILON) };
   }
 
+  // Call visit(x, y, z) for some thousand points that have a position.
+  eachSample(visit) {
+    const step = Math.max(1, Math.floor(this.shown / SAMPLE));
+    for (let slot = 0; slot < this.shown; slot += step) {
+      const [x, y, z] = this.after.subarray(4 * slot, 4 * slot + 3);
+      if (x > UNKNOWN / 2 && Number.isFinite(x + y + z)) visit(x, y, z);
+    }
+  }
+
   // Centre and radius of what is there, relative to the origin: a box of the middle 99.8 %, so that strays do not count.
   bounds() {
-    const source = this.hasBefore ? this.before : this.after;
-    const width = this.hasBefore ? 3 : 4;
-    const step = Math.max(1, Math.floor(this.shown / SAMPLE));
+    const samples = [[], [], []];
+    this.eachSample((...point) => point.forEach((value, axis) => samples[axis].push(value)));
+    if (samples[0].length === 0) return null;
     const centre = [0, 0, 0];
     let radius = 0;
     for (let axis = 0; axis < 3; axis++) {
-      const values = [];
-      for (let slot = 0; slot < this.shown; slot += step) {
-        const value = source[width * slot + axis];
-        if (Number.isFinite(value) && value > UNKNOWN / 2) values.push(value);
-      }
-      if (values.length === 0) return null;
-      const sorted = Float64Array.from(values).sort();
+      const sorted = Float64Array.from(samples[axis]).sort();
       const low = sorted[Math.floor(0.001 * sorted.length)];
       const high = sorted[Math.ceil(0.999 * (sorted.length - 1))];
       centre[axis] = (low + high) / 2;

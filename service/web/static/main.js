@@ -110,7 +110,8 @@ async function follow(id, before, signal) {
   };
   const job = await followJob(id, { before: before?.xyz ? before : null, hooks, signal });
   if (job.state === "succeeded") {
-    say("Done", 1, { aloud: true });
+    parts.progress.hidden = true;
+    speak("Done");
     showReport(job, parts);
     offerDownload(parts.download, job, showProblem);
     parts.report.hidden = false;

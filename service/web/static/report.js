@@ -30,8 +30,9 @@ export function offerDownload(link, job, onProblem) {
   const path = `jobs/${encodeURIComponent(job.id)}/result`;
   link.href = url(path);
   link.download = job.result.filename;
+  link.title = `${job.result.filename}, ${text.bytes(job.result.bytes)}`;
   link.onclick = async (event) => {
-    if (!apiKey() || link.href.startsWith("blob:")) return;
+    if (!apiKey()) return;
     event.preventDefault();
     try {
       const blob = await (await call(path)).blob();

@@ -5,6 +5,8 @@ import * as text from "./text.js";
 import { Viewer } from "./viewer.js";
 
 const GLIDE_MS = 450;
+const COVERED = 0.6;
+const [SMALLEST, LARGEST] = [1.5, 6];
 
 export class Stage {
   constructor(parts) {
@@ -28,7 +30,10 @@ export class Stage {
     parts.blend.addEventListener("input", () => this.blend(Number(parts.blend.value)));
     parts.before.addEventListener("click", () => this.glide(0));
     parts.after.addEventListener("click", () => this.glide(1));
-    parts.size.addEventListener("input", () => this.viewer.setPointSize(Number(parts.size.value)));
+    parts.size.addEventListener("input", () => {
+      this.isSizeChosen = true;
+      this.viewer.setPointSize(Number(parts.size.value));
+    });
     parts.up.addEventListener("change", () => this.viewer.setUp(parts.up.value));
     parts.fit.addEventListener("click", () => this.viewer.fit());
     parts.canvas.addEventListener("keydown", (event) => {
@@ -43,6 +48,13 @@ export class Stage {
   // Show a cloud (null: none) and a note below it.
   show(cloud, note = "") {
     this.cloud = cloud;
+    if (cloud && this.viewer && !this.isSizeChosen) {
+      const { clientWidth, clientHeight } = this.parts.stage;
+      // As large as makes the points cover a part of the stage, so that a surface looks like one.
+      const size = Math.sqrt((COVERED * clientWidth * clientHeight) / cloud.shown);
+      this.parts.size.value = Math.min(Math.max(size, SMALLEST), LARGEST);
+      this.viewer.setPointSize(Number(this.parts.size.value));
+    }
     this.viewer?.show(cloud);
     this.note(note);
     this.update();

@@ -39,6 +39,7 @@ const FRAGMENT = `
 `;
 const STAGE = { dark: { back: 0x0e1113, plain: 0xa9b3ba }, light: { back: 0xf1f3f4, plain: 0x5d6972 } };
 const FIELD_OF_VIEW = 40;
+const MARGIN = 1.06;
 const TURN = Math.PI / 24;
 
 export class Viewer {
@@ -149,14 +150,29 @@ export class Viewer {
     }
     const { y, z } = this.camera.up;
     const direction = new Vector3(0.75, z ? -1 : 0.55, y ? 1 : 0.55).normalize();
-    const narrow = Math.min(1, this.camera.aspect);
-    const distance = (1.02 * this.radius) / Math.sin((FIELD_OF_VIEW / 2) * (Math.PI / 180)) / narrow;
-    this.camera.position.copy(this.centre).addScaledVector(direction, distance);
+    this.camera.position.copy(this.centre).addScaledVector(direction, this.distanceFor(direction));
     this.controls.target.copy(this.centre);
     this.controls.minDistance = this.radius * 1e-3;
     this.controls.maxDistance = this.radius * 50;
     this.controls.update();
     this.draw();
+  }
+
+  // How far from the centre the camera sees all but a few strays.
+  distanceFor(direction) {
+    const slope = Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
+    const right = new Vector3().crossVectors(this.camera.up, direction).normalize();
+    const up = new Vector3().crossVectors(direction, right);
+    const needed = [];
+    const point = new Vector3();
+    this.cloud?.eachSample((x, y, z) => {
+      point.set(x, y, z).sub(this.centre);
+      const across = Math.max(Math.abs(point.dot(right)) / this.camera.aspect, Math.abs(point.dot(up))) / slope;
+      needed.push(across + point.dot(direction));
+    });
+    if (needed.length === 0) return (1.1 * this.radius) / slope;
+    const sorted = Float64Array.from(needed).sort();
+    return Math.max(MARGIN * sorted[Math.ceil(0.998 * (sorted.length - 1))], 1e-6 * this.radius);
   }
 
   key(event) {

@@ -1,0 +1,286 @@
+"""The job routes over real sockets."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+
+from straightpcf.points.wire.patches import PatchReader
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import RunningServer, run_server
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    with run_server(tmp_path_factory.mktemp("jobs")) as server:
+        server.wait_until_ready()
+        yield server
+
+
+@pytest.fixture
+def http(server: RunningServer) -> Iterator[httpx2.Client]:
+    with httpx2.Client(base_url=server.url, timeout=60) as client:
+        yield client
+
+
+def npy(xyz: np.ndarray[Any, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, xyz)
+    return buffer.getvalue()
+
+
+SMALL = npy(noisy(torus(300), 0.01))
+LARGE = npy(noisy(sphere(60_000), 0.01))  # takes a worker many seconds
+
+
+def make(http: httpx2.Client, body: bytes = SMALL, **headers: str) -> dict[str, Any]:
+    answer = http.post("/jobs?iterations=1", content=body, headers=headers)
+    assert answer.status_code == 202, answer.text
+    return dict(answer.json())
+
+
+def finished(http: httpx2.Client, id: str) -> dict[str, Any]:
+    return dict(http.get(f"/jobs/{id}?wait=60").json())
+
+
+def sse(lines: Iterator[str]) -> list[dict[str, Any]]:
+    events, event = [], {}
+    for line in lines:
+        if line == "" and event:
+            events.append(event)
+            event = {}
+        elif line and not line.startswith(":"):
+            name, _, value = line.partition(": ")
+            event[name] = json.loads(value) if name in ("data", "id") else value
+    return events
+
+
+def test_a_job_goes_its_way_and_its_result_is_that_of_denoise(http: httpx2.Client) -> None:
+    answer = http.post("/jobs?iterations=1&filename=scan.npy", content=SMALL)
+    assert answer.status_code == 202
+    job = answer.json()
+    assert answer.headers["location"] == job["links"]["self"] == f"/jobs/{job['id']}"
+    job = finished(http, job["id"])
+    assert (job["state"], job["progress"], job["points"], job["attempts"]) == ("succeeded", 1.0, 300, 1)
+    result = http.get(job["links"]["result"])
+    assert result.content == http.post("/denoise?iterations=1", content=SMALL).content
+    assert hashlib.sha256(result.content).hexdigest() == job["result"]["sha256"]
+    assert 'filename="scan_clean.npy"' in result.headers["content-disposition"]
+    report = http.get(job["links"]["report"]).json()
+    moved = np.linalg.norm(np.load(io.BytesIO(result.content)) - np.load(io.BytesIO(SMALL)), axis=1)
+    assert np.isclose(report["displacement"]["p50"], np.median(moved))
+    assert report == job["report"]
+
+
+def test_events_replay_behind_the_last_one_seen(http: httpx2.Client) -> None:
+    id = make(http)["id"]
+    with http.stream("GET", f"/jobs/{id}/events") as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        assert answer.headers["x-accel-buffering"] == "no"
+        events = sse(answer.iter_lines())
+    assert [event["id"] for event in events] == list(range(1, len(events) + 1))
+    kinds = [event["event"] for event in events]
+    assert (kinds[0], kinds[-1]) == ("queued", "completed")
+    assert {"start", "progress", "preview", "output"} <= set(kinds)
+    assert events[-1]["data"]["state"] == "succeeded"
+    again = http.get(f"/jobs/{id}/events", headers={"Last-Event-ID": str(len(events) - 2)})
+    assert sse(iter([*again.text.splitlines(), ""])) == events[-2:]
+    assert http.get(f"/jobs/{id}/events", headers={"Last-Event-ID": "x"}).status_code == 400
+
+
+def test_patches_add_up_to_the_result_in_both_forms(http: httpx2.Client) -> None:
+    job = make(http, npy(noisy(torus(2500), 0.01)))
+    reader, xyz, ended = PatchReader(), np.full((2500, 3), np.nan), False
+    with http.stream("GET", job["links"]["stream"]) as answer:  # while it runs
+        for chunk in answer.iter_bytes():
+            for frame in reader.feed(chunk):
+                xyz[frame.indices] = frame.xyz
+                ended = frame.end
+    assert ended
+    result = np.load(io.BytesIO(http.get(job["links"]["result"]).content))
+    assert np.array_equal(xyz, result)
+    lines = http.get(job["links"]["stream"], headers={"Accept": "application/x-ndjson"}).text.splitlines()
+    said = [json.loads(line) for line in lines]
+    assert said[0] == {"points": 2500}
+    assert said[-1] == {"end": True}
+    for line in said[1:-1]:
+        assert np.array_equal(result[line["indices"]], np.array(line["xyz"]))
+
+
+def test_a_result_can_be_fetched_in_parts_and_only_if_it_changed(http: httpx2.Client) -> None:
+    job = finished(http, make(http)["id"])
+    url, size = job["links"]["result"], job["result"]["bytes"]
+    whole = http.get(url)
+    etag = whole.headers["etag"]
+    assert etag == f'"{job["result"]["sha256"]}"'
+    head = http.head(url)
+    assert (head.status_code, head.content, head.headers["content-length"]) == (200, b"", str(size))
+    rest = http.get(url, headers={"Range": "bytes=100-", "If-Range": etag})
+    assert (rest.status_code, rest.content) == (206, whole.content[100:])
+    assert rest.headers["content-range"] == f"bytes 100-{size - 1}/{size}"
+    assert http.get(url, headers={"Range": "bytes=-5"}).content == whole.content[-5:]
+    assert http.get(url, headers={"Range": "bytes=100-", "If-Range": '"other"'}).status_code == 200
+    assert http.get(url, headers={"If-None-Match": etag}).status_code == 304
+    assert http.get(url, headers={"Range": "lines=1-2"}).status_code == 200
+    over = http.get(url, headers={"Range": f"bytes={size}-"})
+    assert (over.status_code, over.json()["code"]) == (416, "range_not_satisfiable")
+
+
+def test_put_makes_one_job_however_often_it_comes(http: httpx2.Client) -> None:
+    id = "scan-" + hashlib.sha256(str(time.time()).encode()).hexdigest()[:8]
+    answers = [http.put(f"/jobs/{id}?iterations=1", content=SMALL) for _ in range(3)]
+    assert [answer.status_code for answer in answers] == [202, 200, 200]
+    other = http.put(f"/jobs/{id}?iterations=2", content=SMALL)
+    assert (other.status_code, other.json()["code"]) == (409, "id_conflict")
+    assert http.put("/jobs/.hidden", content=SMALL).status_code == 400
+
+
+def test_an_idempotency_key_stands_for_one_job_also_when_all_come_at_once(http: httpx2.Client) -> None:
+    key = {"Idempotency-Key": f"key-{time.time_ns()}"}
+    answers: list[httpx2.Response] = []
+
+    def send() -> None:
+        answers.append(http.post("/denoise?iterations=1", content=SMALL, headers=key))
+
+    threads = [threading.Thread(target=send) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {answer.status_code for answer in answers} == {200}
+    assert len({answer.headers["x-job-id"] for answer in answers}) == 1
+    assert len({answer.content for answer in answers}) == 1
+    other = http.post("/denoise?iterations=2", content=SMALL, headers=key)
+    assert (other.status_code, other.json()["code"]) == (422, "idempotency_conflict")
+    assert http.post("/denoise", content=SMALL, headers={"Idempotency-Key": "k" * 256}).status_code == 400
+
+
+def test_prefer_respond_async_and_wait_give_the_job_instead_of_a_timeout(http: httpx2.Client) -> None:
+    for prefer in ("respond-async", "wait=0"):
+        answer = http.post("/denoise?iterations=1", content=LARGE, headers={"Prefer": prefer})
+        assert answer.status_code == 202
+        assert answer.headers["preference-applied"] == prefer
+        job = http.get(answer.headers["location"]).json()
+        assert job["state"] in ("queued", "starting", "processing")
+        early = http.get(job["links"]["result"])
+        assert (early.status_code, early.json()["code"]) == (409, "job_not_finished")
+        assert http.delete(job["links"]["self"]).status_code == 204
+    done = http.post("/denoise?iterations=1", content=SMALL, headers={"Prefer": "wait=60"})
+    assert done.status_code == 200
+
+
+def test_denoise_tells_its_events_and_its_report_on_the_same_response(http: httpx2.Client) -> None:
+    with http.stream("POST", "/denoise?iterations=1", content=SMALL, headers={"Accept": "text/event-stream"}) as answer:
+        events = sse(answer.iter_lines())
+    assert events[-1]["data"]["state"] == "succeeded"
+    plain = http.get(events[-1]["data"]["links"]["result"]).content
+    both = http.post("/denoise?iterations=1&report=true", content=SMALL)
+    assert both.headers["content-type"].startswith("multipart/mixed")
+    boundary = both.headers["content-type"].partition("boundary=")[2].encode()
+    _, report, cloud, end = both.content.split(b"--" + boundary)
+    assert json.loads(report.partition(b"\r\n\r\n")[2])["points"] == 300
+    assert cloud.partition(b"\r\n\r\n")[2][:-2] == plain
+    assert end == b"--\r\n"
+
+
+def test_cancel_frees_the_worker_within_a_second(http: httpx2.Client) -> None:
+    id = make(http, LARGE)["id"]
+    while http.get(f"/jobs/{id}").json()["state"] != "processing":
+        time.sleep(0.02)
+    began = time.monotonic()
+    answer = http.post(f"/jobs/{id}/cancel")
+    assert (answer.status_code, answer.json()["state"]) == (202, "canceled")
+    assert time.monotonic() - began < 3  # a second, and what a busy machine takes
+    assert http.post(f"/jobs/{id}/cancel").status_code == 200
+    gone = http.get(f"/jobs/{id}/result")
+    assert (gone.status_code, gone.json()["code"]) == (409, "job_canceled")
+    assert finished(http, make(http)["id"])["state"] == "succeeded"
+
+
+def test_a_failed_job_says_why_at_every_door(http: httpx2.Client) -> None:
+    job = finished(http, make(http, b"ply\nformat nonsense\n")["id"])
+    assert (job["state"], job["error"]["code"]) == ("failed", "malformed_file")
+    for part in ("result", "report", "stream"):
+        answer = http.get(job["links"][part])
+        assert (answer.status_code, answer.json()["code"]) == (422, "malformed_file"), part
+
+
+def test_pages_and_filters(http: httpx2.Client) -> None:
+    made = [make(http)["id"] for _ in range(3)]
+    for id in made:
+        finished(http, id)
+    first = http.get("/jobs?limit=2").json()
+    assert [job["id"] for job in first["jobs"]] == made[:0:-1]
+    second = http.get(f"/jobs?limit=2&cursor={first['next_cursor']}").json()
+    assert second["jobs"][0]["id"] == made[0]
+    assert http.get("/jobs?state=queued&state=processing").json()["jobs"] == []
+    for query in ("limit=0", "limit=x", "state=nonsense", "cursor=nonsense"):
+        answer = http.get(f"/jobs?{query}")
+        assert answer.status_code in (400, 422), query
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_what_is_not_there_is_a_problem(http: httpx2.Client) -> None:
+    for method, path, status, code in (
+        ("GET", "/jobs/nope", 404, "not_found"),
+        ("GET", "/jobs/nope/events", 404, "not_found"),
+        ("GET", "/jobs/nope/stream", 404, "not_found"),
+        ("DELETE", "/jobs/nope", 404, "not_found"),
+        ("GET", "/nope", 404, "not_found"),
+        ("DELETE", "/denoise", 405, "method_not_allowed"),
+    ):
+        answer = http.request(method, path)
+        assert (answer.status_code, answer.json()["code"]) == (status, code), path
+
+
+def test_metrics_count_jobs_and_requests_by_route(http: httpx2.Client) -> None:
+    http.get(f"/jobs/{make(http)['id']}")
+    text = http.get("/metrics").text
+    assert 'route="/jobs/{id}"' in text
+    assert "straightpcf_ready 1.0" in text
+    assert "straightpcf_jobs{" in text
+
+
+def test_a_key_sees_its_own_jobs_alone(tmp_path: Path) -> None:
+    (tmp_path / "keys").write_text("# the team\nalpha\nbeta\n")
+    with run_server(tmp_path, environment={"STRAIGHTPCF_API_KEYS_FILE": str(tmp_path / "keys")}) as server:
+        server.wait_until_ready()
+        alpha, beta = ({"Authorization": f"Bearer {key}"} for key in ("alpha", "beta"))
+        with httpx2.Client(base_url=server.url, timeout=60) as http:
+            for headers in ({}, {"Authorization": "Bearer nope"}, {"Authorization": "Basic alpha"}):
+                answer = http.post("/jobs", content=SMALL, headers=headers)
+                assert (answer.status_code, answer.json()["code"]) == (401, "unauthorized")
+                assert answer.headers["www-authenticate"] == "Bearer"
+            id = make(http, **alpha)["id"]
+            assert http.get(f"/jobs/{id}", headers=alpha).status_code == 200
+            for path in ("", "/events", "/result", "/stream", "/report"):
+                assert http.get(f"/jobs/{id}{path}", headers=beta).status_code == 404
+            assert http.delete(f"/jobs/{id}", headers=beta).status_code == 404
+            assert http.get("/jobs", headers=beta).json()["jobs"] == []
+            assert {http.get(path).status_code for path in ("/livez", "/healthz", "/readyz")} == {200}
+        assert "alpha" not in server.log.read_text()
+
+
+def test_curl_follows_a_job_as_the_readme_says(server: RunningServer, tmp_path: Path) -> None:
+    (tmp_path / "scan.npy").write_bytes(SMALL)
+    curl = ["curl", "-sf", "--max-time", "60"]
+    made = subprocess.run(
+        [*curl, "-F", f"file=@{tmp_path}/scan.npy", "-F", "iterations=1", f"{server.url}/jobs"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    job = json.loads(made.stdout)
+    events = subprocess.run([*curl, "-N", server.url + job["links"]["events"]], check=True, capture_output=True).stdout
+    assert b"event: completed" in events
+    subprocess.run([*curl, "-o", tmp_path / "out.npy", server.url + job["links"]["result"]], check=True)
+    assert np.load(tmp_path / "out.npy").shape == (300, 3)
