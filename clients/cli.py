@@ -37,7 +37,6 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (OSError, 3),  # a file that is not there, or may not be written
     (Exception, 70),
 )
-LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 
 class Device(StrEnum):
@@ -166,14 +165,6 @@ def serve(
         max_points=max_points,
         max_jobs=max_jobs,
     )
-    if settings.host not in LOOPBACK:
-        typer.secho(
-            f"WARNING: listening on {settings.host}: there are no API keys, so everyone who reaches port "
-            f"{settings.port} can use this server. Put it behind a proxy that asks who they are.",
-            err=True,
-            fg="red",
-            bold=True,
-        )
     run_server(settings)
 
 

@@ -118,18 +118,18 @@ def _load(spec: WorkerSpec) -> Filter:
 
 
 def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
-    sent = 0.0
+    sent, last_iteration = 0.0, 0
 
     def on_progress(fraction: float, iteration: int) -> None:
-        nonlocal sent
+        nonlocal sent, last_iteration
         while pipe.poll():
             message = pipe.recv()
             if message is None:
                 raise EOFError("the server ends this worker")
             if message == Cancel(job.id):
                 raise JobCanceled(f"job {job.id} was canceled")
-        if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS:
-            sent = now
+        if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS or iteration != last_iteration:
+            sent, last_iteration = now, iteration
             pipe.send(Progress(job.id, fraction, iteration))
 
     def on_preview(iteration: int, indices: list[int], xyz: list[list[float]]) -> None:

@@ -102,13 +102,13 @@ def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> N
     assert done.returncode == 4
     assert "error [device_unavailable]" in done.stderr
     assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
+    assert not list((tmp_path / "incoming").iterdir())
 
 
 def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
     (taken := tmp_path / "file").write_bytes(b"")  # no folder: the server ends as soon as it has warned
     done = cli("serve", "--host", "0.0.0.0", "--port", "0", "--data-dir", taken / "data")
-    assert "WARNING: listening on 0.0.0.0" in done.stderr
+    assert "NO API KEYS ARE SET and this server listens on 0.0.0.0" in done.stderr
     assert done.returncode != 0
 
 
