@@ -1,47 +1,34 @@
-"""The sync and the async client: a loop of attempts each, around one pure core."""
+"""The client for ordinary code: methods with names and types around flows."""
 
 from __future__ import annotations
 
-import asyncio
-import itertools
-import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self, TypeVar
+from typing import Self
 
-import httpx2
-
-from straightpcf.clients.atomic import replaced_when_complete
-from straightpcf.clients.sdk.request import Call, Source, denoise_call
-from straightpcf.clients.sdk.response import (
-    Health,
-    ServerInfo,
-    failed_connection,
-    failed_response,
-    parse_health,
-    parse_info,
-)
+from straightpcf.clients.sdk import flows
+from straightpcf.clients.sdk.events import Event
+from straightpcf.clients.sdk.flows import OnProgress
+from straightpcf.clients.sdk.job_info import JobInfo, JobState
+from straightpcf.clients.sdk.receive import Events, Patches
+from straightpcf.clients.sdk.request import Iterations, Source, events_call, patches_call
+from straightpcf.clients.sdk.response import Health, ServerInfo, parse_health, parse_info
 from straightpcf.clients.sdk.result import Denoised
-from straightpcf.clients.sdk.retry import MAX_RETRIES, next_delay
+from straightpcf.clients.sdk.retry import MAX_RETRIES
+from straightpcf.clients.sdk.transport import Transport
+from straightpcf.points.wire.patches import PatchFrame
 
-__all__ = ["CONNECT_TIMEOUT_SECONDS", "DEFAULT_TIMEOUT_SECONDS", "AsyncClient", "Client"]
+__all__ = ["DEFAULT_TIMEOUT_SECONDS", "Client", "Job", "Jobs"]
 
-DEFAULT_TIMEOUT_SECONDS = 600.0  # of silence: the server says nothing while it computes
-CONNECT_TIMEOUT_SECONDS = 10.0
-
-_HEALTH = Call(method="GET", path="/healthz")
-_INFO = Call(method="GET", path="/v1/info")
-
-_T = TypeVar("_T")
+DEFAULT_TIMEOUT_SECONDS = 60.0  # of silence: a server that works says something every 20
 
 
 class Client:
     """Call a server from ordinary code; use it as a context manager or close it.
 
-    url: where the server is, "http://127.0.0.1:8000".
-    api_key: sent as a bearer token.
-    timeout: seconds of silence that are borne while the server computes, None for ever.
+    url: where the server is, "http://127.0.0.1:8000". api_key: sent as a bearer token.
+    timeout: seconds of silence that are borne, None for any.
     max_retries: of a busy server and of a broken connection; every other error is raised at once.
     """
 
@@ -53,8 +40,8 @@ class Client:
         timeout: float | None = DEFAULT_TIMEOUT_SECONDS,
         max_retries: int = MAX_RETRIES,
     ) -> None:
-        self._max_retries = max_retries
-        self._http = httpx2.Client(**_http_options(url, api_key, timeout))
+        self._transport = Transport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+        self.jobs = Jobs(self._transport)
 
     def __enter__(self) -> Self:
         return self
@@ -64,166 +51,133 @@ class Client:
 
     def close(self) -> None:
         """Close the connections."""
-        self._http.close()
+        self._transport.close()
 
     def denoise(
         self,
         source: Source,
         target: str | Path | None = None,
         *,
-        iterations: int | Literal["auto"] = "auto",
+        iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
         format: str | None = None,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
     ) -> Denoised:
         """Denoise one cloud: the same points in the same order, every other field unchanged.
 
         source: a path, the bytes of a file, an (N, 3) array, or an open3d cloud.
-        target: where to write the result; by default it is held in memory.
+        target: where to write the result, complete or not at all; by default it is held in memory.
         format: of the result; by default that of the target's name, else that of the source.
-        Raises the StraightPCFError that the server met; a target is written complete or not at all.
+        timeout: seconds after which JobNotFinished is raised. on_progress: called with the share that is done, 0..1.
+        Raises the StraightPCFError that the server met. Whatever ends this early ends the work on the server too.
         """
         path = None if target is None else Path(target)
-        call = denoise_call(source, path, iterations=iterations, seed=seed, strength=strength, format=format)
-
-        def receive(response: httpx2.Response) -> Denoised:
-            if path is None:
-                return Denoised.from_headers(response.headers, content=response.read(), source=_open3d_cloud(source))
-            with replaced_when_complete(path) as unfinished, unfinished.open("wb") as file:
-                for chunk in response.iter_bytes():
-                    file.write(chunk)
-            return Denoised.from_headers(response.headers, path=path, source=_open3d_cloud(source))
-
-        return self._send(call, receive)
+        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "format": format}
+        return self._transport.run(flows.denoise(source, path, on_progress, timeout, **wanted))
 
     def health(self) -> Health:
         """Ask whether the server is there, and warm."""
-        return self._send(_HEALTH, _read_then(parse_health))
+        return self._transport.run(flows.read("/healthz", parse_health))
 
     def info(self) -> ServerInfo:
         """Ask what the server is and takes."""
-        return self._send(_INFO, _read_then(parse_info))
-
-    def _send(self, call: Call, receive: Callable[[httpx2.Response], _T]) -> _T:
-        for attempt in itertools.count():
-            try:
-                with call.open_body() as body, self._http.stream(**_request(call), content=body) as response:
-                    if response.is_success:
-                        return receive(response)
-                    response.read()
-                    failure = failed_response(response)
-            except httpx2.TransportError as fault:
-                failure = failed_connection(fault, self._http.base_url)
-            delay = next_delay(failure, attempt=attempt, max_retries=self._max_retries)
-            if delay is None:
-                raise failure.error from failure.cause
-            time.sleep(delay)
-        raise AssertionError("unreachable")
+        return self._transport.run(flows.read("/v1/info", parse_info))
 
 
-class AsyncClient:
-    """Call a server from a coroutine; the same as `Client` otherwise."""
+class Jobs:
+    """Make and find jobs."""
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        api_key: str | None = None,
-        timeout: float | None = DEFAULT_TIMEOUT_SECONDS,
-        max_retries: int = MAX_RETRIES,
-    ) -> None:
-        self._max_retries = max_retries
-        self._http = httpx2.AsyncClient(**_http_options(url, api_key, timeout))
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
-        await self.aclose()
-
-    async def aclose(self) -> None:
-        """Close the connections."""
-        await self._http.aclose()
-
-    async def denoise(
+    def create(
         self,
         source: Source,
-        target: str | Path | None = None,
         *,
-        iterations: int | Literal["auto"] = "auto",
+        iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
         format: str | None = None,
-    ) -> Denoised:
-        """Denoise one cloud, as `Client.denoise`; cancelling the coroutine cancels the work on the server."""
-        path = None if target is None else Path(target)
-        call = denoise_call(source, path, iterations=iterations, seed=seed, strength=strength, format=format)
+        name: str | None = None,
+        id: str | None = None,
+        idempotency_key: str | None = None,
+    ) -> Job:
+        """Hand over a cloud and return at once; the job survives this process, and the server's.
 
-        async def receive(response: httpx2.Response) -> Denoised:
-            if path is None:
-                content = await response.aread()
-                return Denoised.from_headers(response.headers, content=content, source=_open3d_cloud(source))
-            with replaced_when_complete(path) as unfinished, unfinished.open("wb") as file:
-                async for chunk in response.aiter_bytes():
-                    await asyncio.to_thread(file.write, chunk)
-            return Denoised.from_headers(response.headers, path=path, source=_open3d_cloud(source))
+        name: of the file, where the source has none. id: 1..64 of A-Z a-z 0-9 . _ -, chosen by the server if None; the
+        same request with the same id, or with the same idempotency_key, finds the job that it made before.
+        """
+        flow = flows.create(
+            source, iterations=iterations, seed=seed, strength=strength, format=format, name=name, id=id,
+            key=idempotency_key,
+        )  # fmt: skip
+        return Job(self._transport, self._transport.run(flow))
 
-        return await self._send(call, receive)
+    def get(self, id: str) -> Job:
+        """Find a job; raises NotFound."""
+        return Job(self._transport, self._transport.run(flows.get(id)))
 
-    async def health(self) -> Health:
-        """Ask whether the server is there, and warm."""
-        return await self._send(_HEALTH, _aread_then(parse_health))
-
-    async def info(self) -> ServerInfo:
-        """Ask what the server is and takes."""
-        return await self._send(_INFO, _aread_then(parse_info))
-
-    async def _send(self, call: Call, receive: Callable[[httpx2.Response], Awaitable[_T]]) -> _T:
-        for attempt in itertools.count():
-            try:
-                async with self._http.stream(**_request(call), content=call.stream_body()) as response:
-                    if response.is_success:
-                        return await receive(response)
-                    await response.aread()
-                    failure = failed_response(response)
-            except httpx2.TransportError as fault:
-                failure = failed_connection(fault, self._http.base_url)
-            delay = next_delay(failure, attempt=attempt, max_retries=self._max_retries)
-            if delay is None:
-                raise failure.error from failure.cause
-            await asyncio.sleep(delay)
-        raise AssertionError("unreachable")
+    def list(self, *, states: Collection[JobState] = (), page_size: int = 50) -> Iterator[Job]:
+        """Yield this key's jobs, newest first, asking for a page at a time."""
+        cursor: str | None = None
+        while True:
+            jobs, cursor = self._transport.run(flows.page(states, page_size, cursor))
+            yield from (Job(self._transport, info) for info in jobs)
+            if cursor is None:
+                return
 
 
-def _http_options(url: str, api_key: str | None, timeout: float | None) -> dict[str, Any]:
-    return {
-        "base_url": url,
-        "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
-        "timeout": httpx2.Timeout(timeout, connect=CONNECT_TIMEOUT_SECONDS),
-    }
+class Job:
+    """Stand for one job on the server; `info` is what was last heard of it."""
 
+    def __init__(self, transport: Transport, info: JobInfo) -> None:
+        self._transport = transport
+        self.info = info
 
-def _request(call: Call) -> dict[str, Any]:
-    return {"method": call.method, "url": call.path, "params": call.params, "headers": call.headers}
+    def __repr__(self) -> str:
+        return f"<Job {self.id} {self.info.state} {self.info.progress:.0%}>"
 
+    @property
+    def id(self) -> str:
+        """The job's name on the server."""
+        return self.info.id
 
-def _open3d_cloud(source: Source) -> Any:
-    return source if type(source).__module__.startswith("open3d") else None
+    def refresh(self) -> JobInfo:
+        """Ask how it stands."""
+        self.info = self._transport.run(flows.get(self.id))
+        return self.info
 
+    def wait(self, *, timeout: float | None = None, on_progress: OnProgress | None = None) -> JobInfo:
+        """Return when it is finished, well or not; raises JobNotFinished after timeout seconds."""
+        self.info = self._transport.run(flows.wait(self.id, timeout, on_progress))
+        return self.info
 
-def _read_then(parse: Callable[[httpx2.Response], _T]) -> Callable[[httpx2.Response], _T]:
-    def receive(response: httpx2.Response) -> _T:
-        response.read()
-        return parse(response)
+    def events(self, *, after: int = 0) -> Iterator[Event]:
+        """Yield what happened behind event `after` and what happens next, until `Completed`; connects again itself."""
+        receiver = Events(after=after)
+        for _ in self._transport.stream((events_call(self.id), receiver)):
+            yield from receiver.take()
 
-    return receive
+    def patches(self) -> Iterator[PatchFrame]:
+        """Yield finished patches as they come: the last position of a row is its result. Raises what the job met."""
+        receiver = Patches()
+        for _ in self._transport.stream((patches_call(self.id), receiver)):
+            yield from receiver.take()
 
+    def result(self, target: str | Path | None = None) -> Denoised:
+        """Download the result, going on where a connection broke, checked against its sha256.
 
-def _aread_then(parse: Callable[[httpx2.Response], _T]) -> Callable[[httpx2.Response], Awaitable[_T]]:
-    async def receive(response: httpx2.Response) -> _T:
-        await response.aread()
-        return parse(response)
+        Raises JobNotFinished, JobExpired, JobCanceled, or what the job failed with.
+        """
+        return self._transport.run(flows.fetch(self.info, None if target is None else Path(target)))
 
-    return receive
+    def cancel(self) -> JobInfo:
+        """End it."""
+        self.info = self._transport.run(flows.cancel(self.id))
+        return self.info
+
+    def delete(self) -> None:
+        """End it, and remove its files and all that is known of it."""
+        self._transport.run(flows.delete(self.id))

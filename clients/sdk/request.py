@@ -1,14 +1,16 @@
-"""Turn what a user hands over into one HTTP request; touches no network."""
+"""Turn what a user asks for into one HTTP request; touches no network."""
 
 from __future__ import annotations
 
 import asyncio
 import io
-from collections.abc import AsyncIterator, Iterator
+import uuid
+from collections.abc import AsyncIterator, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal, TypeAlias
+from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
@@ -16,24 +18,51 @@ import numpy.typing as npt
 from straightpcf.points.errors import InvalidCloud
 from straightpcf.points.formats import format_for, format_named
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 
-__all__ = ["Call", "Source", "denoise_call"]
+__all__ = [
+    "Call",
+    "Iterations",
+    "Source",
+    "cancel_call",
+    "delete_call",
+    "events_call",
+    "get_call",
+    "job_call",
+    "list_call",
+    "patches_call",
+    "result_call",
+    "upload_call",
+]
 
 CHUNK_BYTES = 2**18
 
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.
 Source: TypeAlias = str | Path | bytes | npt.NDArray[Any] | Any
+Iterations: TypeAlias = int | Literal["auto"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Call:
-    """Describe one request; the body can be opened again for every attempt."""
+    """Describe one request; the body can be opened again for every attempt.
 
-    method: Literal["GET", "POST"]
+    request_id: names the request in the server's log, the same for every attempt.
+    timeout: seconds of silence to bear, None for the client's own. events: the answer is a stream of events.
+    """
+
+    method: Literal["GET", "POST", "PUT", "DELETE"]
     path: str
-    params: dict[str, str] = field(default_factory=dict)
-    headers: dict[str, str] = field(default_factory=dict)
+    params: Mapping[str, str | list[str]] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | Path | None = None
+    timeout: float | None = None
+    events: bool = False
+    once: bool = False
+    request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    def all_headers(self) -> dict[str, str]:
+        """Return the headers to send."""
+        return {"X-Request-Id": self.request_id, **self.headers}
 
     @contextmanager
     def open_body(self) -> Iterator[bytes | IO[bytes] | None]:
@@ -49,12 +78,27 @@ class Call:
         return _read_chunks(self.body) if isinstance(self.body, Path) else self.body
 
 
-def denoise_call(
-    source: Source, target: Path | None, *, iterations: int | str, seed: int, strength: float, format: str | None
+def upload_call(
+    source: Source,
+    target: Path | None = None,
+    *,
+    iterations: Iterations | str,
+    seed: int,
+    strength: float,
+    format: str | None,
+    name: str | None = None,
+    key: str | None = None,
+    id: str | None = None,
 ) -> Call:
-    """Build the request of one cloud; raises InvalidOptions, InvalidCloud, UnknownFormat before anything is sent."""
+    """Build the request that hands over one cloud, as job `id`.
+
+    Raises InvalidOptions, InvalidCloud, UnknownFormat, OSError before anything is sent.
+    """
     options = DenoiseOptions.parse(iterations=str(iterations), seed=str(seed), strength=str(strength))
-    name, body = _name_and_body(source)
+    if target is not None and not target.parent.is_dir():
+        raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
+    own_name, body = _name_and_body(source)
+    name = name or own_name
     if format is None and target is not None and target.suffix.lower() != Path(name or "").suffix.lower():
         format = format_for(target.name).name
     params = {"iterations": str(options.iterations), "seed": str(options.seed), "strength": str(options.strength)}
@@ -63,8 +107,63 @@ def denoise_call(
     if format is not None:
         params["format"] = format_named(format).name
     size = body.stat().st_size if isinstance(body, Path) else len(body)
-    headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
-    return Call(method="POST", path="/denoise", params=params, headers=headers, body=body)
+    headers = {
+        "Content-Type": "application/octet-stream",
+        "Content-Length": str(size),
+        **({} if key is None else {"Idempotency-Key": key}),
+    }
+    # PUT: whoever chose the id can cancel the job even if the answer never arrived.
+    return Call(method="PUT", path=_job(id or uuid.uuid4().hex), params=params, headers=headers, body=body)
+
+
+def get_call(path: str) -> Call:
+    """Build a plain GET."""
+    return Call(method="GET", path=path)
+
+
+def job_call(id: str, *, wait: float = 0.0) -> Call:
+    """Build the request that looks at a job, `wait` seconds long if it is not finished."""
+    return Call(method="GET", path=_job(id), params={"wait": f"{wait:g}"} if wait > 0 else {})
+
+
+def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
+    """Build the request for one page of jobs."""
+    params: dict[str, str | list[str]] = {"limit": str(limit)}
+    if states:
+        params["state"] = list(states)
+    if cursor is not None:
+        params["cursor"] = cursor
+    return Call(method="GET", path="/jobs", params=params)
+
+
+def events_call(id: str) -> Call:
+    """Build the request that follows a job."""
+    headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
+    return Call(method="GET", path=_job(id, "events"), headers=headers, events=True)
+
+
+def patches_call(id: str) -> Call:
+    """Build the request for the patch stream."""
+    return Call(method="GET", path=_job(id, "stream"), headers={"Accept": PATCHES_MEDIA_TYPE})
+
+
+def result_call(id: str) -> Call:
+    """Build the request for a result."""
+    return Call(method="GET", path=_job(id, "result"), headers={"Accept-Encoding": "identity"})
+
+
+def cancel_call(id: str) -> Call:
+    """Build the request that ends a job."""
+    return Call(method="POST", path=_job(id, "cancel"))
+
+
+def delete_call(id: str, *, timeout: float | None = None) -> Call:
+    """Build the request that removes a job; with a timeout it is tried once."""
+    return Call(method="DELETE", path=_job(id), timeout=timeout, once=timeout is not None)
+
+
+def _job(id: str, part: str = "") -> str:
+    return f"/jobs/{quote(id, safe='')}" + (f"/{part}" if part else "")
 
 
 def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:

@@ -22,15 +22,8 @@ from straightpcf.points.errors import (
 
 __all__ = ["Health", "ServerInfo", "failed_connection", "failed_response", "parse_health", "parse_info"]
 
-# A request that may have reached the server is sent again only because denoising is idempotent.
-# Not in the list: a timeout while waiting for the result, which the next attempt would only meet again.
-_RETRYABLE_FAULTS = (
-    httpx2.ConnectError,
-    httpx2.ConnectTimeout,
-    httpx2.ReadError,
-    httpx2.WriteError,
-    httpx2.RemoteProtocolError,
-)
+# A request that may have reached the server is sent again only because every one of ours is idempotent.
+_RETRYABLE_FAULTS = (httpx2.NetworkError, httpx2.TimeoutException, httpx2.RemoteProtocolError, httpx2.SSEError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +49,13 @@ class ServerInfo:
     formats: tuple[str, ...]
 
 
-def parse_health(response: httpx2.Response) -> Health:
+def parse_health(body: Mapping[str, Any]) -> Health:
     """Read GET /healthz."""
-    body = response.json()
     return Health(status=body["status"], ready=body["ready"])
 
 
-def parse_info(response: httpx2.Response) -> ServerInfo:
+def parse_info(body: Mapping[str, Any]) -> ServerInfo:
     """Read GET /v1/info; what a newer server adds is left out."""
-    body = response.json()
     plain = ("version", "model", "weights", "max_bytes", "max_points", "max_jobs", "max_iterations")
     return ServerInfo(
         **{name: body[name] for name in plain},
@@ -86,7 +77,7 @@ def failed_response(response: httpx2.Response) -> Failure:
     )
 
 
-def failed_connection(fault: httpx2.TransportError, url: object) -> Failure:
+def failed_connection(fault: httpx2.TransportError | httpx2.SSEError, url: object) -> Failure:
     """Turn what the network did into our error."""
     error = ConnectionFailed(f"{url}: {type(fault).__name__}: {fault}")
     return Failure(error=error, retryable=isinstance(fault, _RETRYABLE_FAULTS), cause=fault)

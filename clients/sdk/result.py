@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from email.message import Message
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
 from straightpcf.clients.atomic import replaced_when_complete
+from straightpcf.clients.sdk.job_info import JobInfo, Report
 
 __all__ = ["Denoised"]
 
@@ -24,34 +22,50 @@ __all__ = ["Denoised"]
 class Denoised:
     """Hold one result, on disk at `path` if a target was named, else in memory as `content`.
 
-    noise_before, noise_after: the server's estimates in the cloud's own unit, NaN if unknown.
-    untouched: points that were NaN or infinite and passed through.
+    job: as the server told it at the end. source: the open3d cloud that was sent, if one was.
     """
 
-    filename: str
+    job: JobInfo
     request_id: str
-    points: int
-    iterations: int
-    noise_before: float
-    noise_after: float
-    untouched: int
     content: bytes | None = field(default=None, repr=False)
     path: Path | None = None
     source: Any = field(default=None, repr=False)
 
-    @classmethod
-    def from_headers(cls, headers: Mapping[str, str], **held: Any) -> Denoised:
-        """Read the headers of a successful response."""
-        return cls(
-            filename=_filename(headers.get("Content-Disposition", "")),
-            request_id=headers.get("X-Request-Id", ""),
-            points=int(headers["X-Points"]),
-            iterations=int(headers["X-Iterations"]),
-            noise_before=float(headers["X-Noise-Before"]),
-            noise_after=float(headers["X-Noise-After"]),
-            untouched=int(headers["X-Untouched"]),
-            **held,
-        )
+    @property
+    def report(self) -> Report:
+        """What was done: passes, noise, displacement, timings, warnings."""
+        assert self.job.report is not None
+        return self.job.report
+
+    @property
+    def filename(self) -> str:
+        """The name that the server gives the file, without folders."""
+        return Path(self.job.result.filename).name if self.job.result is not None else "cloud"
+
+    @property
+    def points(self) -> int:
+        """How many points the cloud has."""
+        return self.report.points
+
+    @property
+    def iterations(self) -> int:
+        """How many passes were made."""
+        return self.report.iterations
+
+    @property
+    def noise_before(self) -> float:
+        """The noise's std as estimated before, in the cloud's own unit, NaN if unknown."""
+        return self.report.noise_before
+
+    @property
+    def noise_after(self) -> float:
+        """The noise's std as estimated after the last pass, in the cloud's own unit, NaN if unknown."""
+        return self.report.noise_after
+
+    @property
+    def untouched(self) -> int:
+        """How many points were NaN or infinite and passed through."""
+        return self.report.untouched
 
     @cached_property
     def xyz(self) -> npt.NDArray[np.floating[Any]]:
@@ -87,10 +101,3 @@ class Denoised:
         cloud = open3d.geometry.PointCloud(self.source) if self.source is not None else open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(np.asarray(self.xyz, dtype=np.float64))
         return cloud
-
-
-def _filename(disposition: str) -> str:
-    message = Message()
-    message["Content-Disposition"] = disposition
-    name = message.get_filename() or "cloud"
-    return Path(unquote(name)).name

@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 
 from straightpcf.clients import sdk
-from straightpcf.clients.sdk import AsyncClient, Client, retry
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, retry
+from straightpcf.clients.sdk.aio import AsyncJobs
+from straightpcf.clients.sdk.client import Jobs
 from straightpcf.points.errors import (
     ConnectionFailed,
     InternalError,
@@ -48,10 +50,20 @@ def scan(tmp_path: Path) -> Path:
 
 
 def test_the_public_names_are_these() -> None:
-    assert sdk.__all__ == ["AsyncClient", "Client", "Denoised", "Health", "ServerInfo"]
-    methods = {name for name in vars(Client) if not name.startswith("_")}
-    assert methods == {"close", "denoise", "health", "info"}
-    assert {name for name in vars(AsyncClient) if not name.startswith("_")} == {"aclose", *methods} - {"close"}
+    assert sdk.__all__ == [
+        "AsyncClient", "AsyncJob", "Client", "Completed", "Denoised", "Event", "Health", "Job", "JobInfo", "Log",
+        "Output", "Preview", "Progress", "Queued", "Report", "ResultInfo", "ServerInfo", "Started",
+    ]  # fmt: skip
+    assert public(Client) == {"close", "denoise", "health", "info"}
+    assert public(AsyncClient) == {"aclose", "denoise", "health", "info"}
+    assert public(Job) == public(AsyncJob) == {
+        "cancel", "delete", "events", "id", "patches", "refresh", "result", "wait",
+    }  # fmt: skip
+    assert public(Jobs) == public(AsyncJobs) == {"create", "get", "list"}
+
+
+def public(kind: type) -> set[str]:
+    return {name for name in vars(kind) if not name.startswith("_")}
 
 
 def test_the_sdk_imports_neither_torch_nor_a_server() -> None:

@@ -1,0 +1,272 @@
+"""Jobs through the SDK, over connections that hold and over some that do not."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.clients.sdk import AsyncClient, Client, Completed, Output, Preview, Progress, Queued, Started, retry
+from straightpcf.points.errors import (
+    ConnectionFailed,
+    IdConflict,
+    InvalidRequest,
+    JobCanceled,
+    JobNotFinished,
+    NotFound,
+    TooFewPoints,
+)
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import RunningServer
+
+SMALL = noisy(torus(400), 0.01)
+LARGE = noisy(sphere(60_000), 0.01)  # takes the worker many seconds
+
+
+@pytest.fixture
+def client(server: RunningServer) -> Iterator[Client]:
+    with Client(server.url) as client:
+        yield client
+
+
+def test_a_job_goes_from_create_to_result(client: Client, tmp_path: Path) -> None:
+    job = client.jobs.create(SMALL, iterations=1)
+    info = job.wait()
+    assert (info.state, info.points, info.progress, info.options.iterations) == ("succeeded", 400, 1.0, 1)
+    result = job.result(tmp_path / "clean.npy")
+    assert result.content is None
+    assert result.job.result is not None
+    assert hashlib.sha256((tmp_path / "clean.npy").read_bytes()).hexdigest() == result.job.result.sha256
+    assert result.xyz.shape == SMALL.shape
+    np.testing.assert_array_equal(result.xyz, client.denoise(SMALL, iterations=1).xyz)
+    assert client.jobs.get(job.id).info.report == result.report
+    job.delete()
+    with pytest.raises(NotFound):
+        job.refresh()
+
+
+def test_the_same_id_finds_the_same_job_and_another_request_a_conflict(client: Client) -> None:
+    first = client.jobs.create(SMALL, iterations=1, id="mine-1")
+    assert client.jobs.create(SMALL, iterations=1, id="mine-1").info.created_at == first.info.created_at
+    with pytest.raises(IdConflict):
+        client.jobs.create(SMALL, iterations=2, id="mine-1")
+    one = client.jobs.create(SMALL, iterations=1, idempotency_key="k")
+    assert client.jobs.create(SMALL, iterations=1, idempotency_key="k").id == one.id
+    for job in (first, one):
+        job.delete()
+
+
+def test_the_list_goes_through_all_pages(client: Client) -> None:
+    jobs = [client.jobs.create(SMALL, iterations=1) for _ in range(5)]
+    for job in jobs:
+        job.wait()
+    listed = [job.id for job in client.jobs.list(states=["succeeded"], page_size=2)]
+    assert listed[:5] == [job.id for job in reversed(jobs)]
+    for job in jobs:
+        job.delete()
+
+
+def test_events_and_patches_tell_the_whole_story(client: Client) -> None:
+    job = client.jobs.create(noisy(torus(2500), 0.01), iterations=1)
+    xyz = np.full((2500, 3), np.nan)
+    for frame in job.patches():
+        xyz[frame.indices] = frame.xyz
+    events = list(job.events())
+    assert [type(event) for event in events[:2]] == [Queued, Started]
+    assert {Progress, Preview, Output} <= {type(event) for event in events}
+    assert isinstance(events[-1], Completed)
+    assert [event.id for event in events] == list(range(1, len(events) + 1))
+    assert list(job.events(after=events[-2].id)) == events[-1:]
+    np.testing.assert_allclose(xyz, job.result().xyz)
+    job.delete()
+
+
+def test_progress_is_told_with_and_without_a_limit(client: Client) -> None:
+    for timeout in (None, 60.0):
+        told: list[float] = []
+        client.denoise(SMALL, iterations=1, on_progress=told.append, timeout=timeout)
+        assert told == sorted(told)
+        assert told[-1] == 1.0
+
+
+def test_a_wait_that_is_too_short_ends_and_a_denoise_takes_its_job_along(client: Client) -> None:
+    job = client.jobs.create(LARGE, iterations=1)
+    with pytest.raises(JobNotFinished):
+        job.wait(timeout=0.2)
+    with pytest.raises(JobNotFinished):
+        job.result()
+    assert job.cancel().state == "canceled"
+    with pytest.raises(JobCanceled):
+        job.result()
+    with pytest.raises(JobCanceled):
+        list(job.patches())
+    job.delete()
+    with pytest.raises(JobNotFinished):
+        client.denoise(LARGE, iterations=1, timeout=0.3)
+    assert not list(client.jobs.list(states=["queued", "starting", "processing"]))
+
+
+def test_a_failed_job_raises_the_class_of_its_code(client: Client) -> None:
+    job = client.jobs.create(sphere(5))
+    assert job.wait().state == "failed"
+    for ask in (job.result, lambda: list(job.patches())):
+        with pytest.raises(TooFewPoints):
+            ask()
+    job.delete()
+
+
+def test_the_async_client_does_the_same_and_a_cancelled_coroutine_ends_its_job(server: RunningServer) -> None:
+    async def use() -> None:
+        async with AsyncClient(server.url) as client:
+            job = await client.jobs.create(SMALL, iterations=1)
+            frames = [frame async for frame in job.patches()]
+            assert sum(len(frame.indices) for frame in frames) >= 400
+            assert isinstance([event async for event in job.events()][-1], Completed)
+            assert (await job.wait()).finished
+            assert (await job.result()).points == 400
+            assert [found.id async for found in client.jobs.list()].index(job.id) == 0
+            await job.delete()
+            told: list[float] = []
+            task = asyncio.create_task(client.denoise(LARGE, iterations=1, on_progress=told.append))
+            while not told:
+                await asyncio.sleep(0.05)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            assert [job async for job in client.jobs.list(states=["queued", "starting", "processing"])] == []
+
+    asyncio.run(use())
+
+
+@contextmanager
+def cutting_proxy(server: RunningServer, *, limits: Iterator[int], damage: int = -1) -> Iterator[tuple[str, list[str]]]:
+    """Pass connections on and cut each answer after so many bytes; a byte at `damage` is changed in the first one.
+
+    Collects the Range headers that were sent.
+    """
+    host, port = server.url.removeprefix("http://").split(":")
+    ranges: list[str] = []
+
+    def pass_on(client: socket.socket, limit: int, damage: int) -> None:
+        with client, socket.create_connection((host, int(port))) as upstream:
+
+            def forward() -> None:
+                try:
+                    while data := client.recv(65536):
+                        ranges.extend(
+                            line.decode() for line in data.split(b"\r\n") if line.lower().startswith(b"range:")
+                        )
+                        upstream.sendall(data)
+                except OSError:
+                    pass
+
+            threading.Thread(target=forward, daemon=True).start()
+            sent = 0
+            try:
+                while sent < limit and (data := upstream.recv(min(65536, limit - sent))):
+                    if sent <= damage < sent + len(data):
+                        at = damage - sent
+                        data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+                    client.sendall(data)
+                    sent += len(data)
+            except OSError:
+                pass
+            for end in (client, upstream):
+                with suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+
+    def listen(listener: socket.socket) -> None:
+        first = damage
+        for limit in limits:
+            try:
+                client, _ = listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=pass_on, args=(client, limit, first), daemon=True).start()
+            first = -1
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=listen, args=(listener,), daemon=True).start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", ranges
+
+
+@pytest.fixture
+def done(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    job = client.jobs.create(noisy(torus(2500), 0.01), iterations=1)
+    job.wait()
+    yield job
+    job.delete()
+
+
+def test_a_download_that_breaks_goes_on_where_it_was(server: RunningServer, done: Any, tmp_path: Path) -> None:
+    whole = done.result().content
+    with cutting_proxy(server, limits=repeat(9000)) as (url, ranges), Client(url, max_retries=2) as client:
+        job = client.jobs.get(done.id)
+        job.result(tmp_path / "clean.npy")
+    assert (tmp_path / "clean.npy").read_bytes() == whole
+    starts = [int(line.split("=")[1].rstrip("-")) for line in ranges]
+    assert len(starts) >= 4  # more than max_retries: an attempt that got on is no failure
+    assert starts == sorted(set(starts))
+
+
+def test_events_and_patches_go_on_over_cut_connections(server: RunningServer, done: Any) -> None:
+    frames, events = list(done.patches()), list(done.events())
+    growing = (2000 * n for n in range(1, 1000))
+    with cutting_proxy(server, limits=growing) as (url, _), Client(url, max_retries=9) as client:
+        job = client.jobs.get(done.id)
+        assert list(job.events()) == events
+        again = list(job.patches())
+        assert [frame.progress for frame in again] == [frame.progress for frame in frames]
+
+
+def test_a_file_that_arrives_damaged_is_fetched_again(server: RunningServer, done: Any) -> None:
+    whole = done.result().content
+    with cutting_proxy(server, limits=repeat(10**9), damage=20_000) as (url, _), Client(url) as client:
+        assert client.jobs.get(done.id).result().content == whole
+
+
+def test_a_call_that_never_gets_on_is_given_up_and_leaves_no_file(
+    server: RunningServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    with (
+        cutting_proxy(server, limits=repeat(50)) as (url, _),
+        Client(url, max_retries=2) as client,
+        pytest.raises(ConnectionFailed),
+    ):
+        client.denoise(SMALL, tmp_path / "clean.npy", iterations=1)
+    assert not list(tmp_path.iterdir())
+    with Client(server.url) as client:
+        assert not list(client.jobs.list(states=["queued", "starting", "processing"]))
+
+
+def test_a_server_of_another_kind_is_called_so() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(65536)
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\nConnection: close\r\n\r\nhola")
+
+        threading.Thread(target=answer, daemon=True).start()
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        with Client(url) as client, pytest.raises(ConnectionFailed, match="no StraightPCF server"):
+            client.info()
+
+
+def test_a_bad_id_and_a_missing_folder_are_refused(client: Client, tmp_path: Path) -> None:
+    with pytest.raises(InvalidRequest):
+        client.jobs.create(SMALL, id=".hidden")
+    with pytest.raises(FileNotFoundError):
+        client.denoise(SMALL, tmp_path / "nowhere" / "clean.npy")
