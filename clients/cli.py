@@ -1,42 +1,26 @@
-"""The command line: validate, hand over, report. Everything heavy is imported by the command that needs it.
-
-Exit codes: 0 done, 1 no result for a reason outside (the port is taken), 2 usage, 3 bad input, 4 a device or a
-package is missing, 5 busy or unreachable, 70 our fault, 130 interrupted. Errors are one line on stderr.
-"""
+"""The command line: validate, hand over, report. Everything heavy is imported by the command that needs it."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
 import typer
 from typer.core import TyperGroup
 
 import straightpcf
+from straightpcf.clients import job_commands
+from straightpcf.clients.console import complain, exit_code, needs, print_json, print_table, progress_bar, show_noise
+from straightpcf.clients.job_commands import Format, Iterations, Key, Seed, Strength
 from straightpcf.points import errors
 
-__all__ = ["EXIT_CODES", "app", "exit_code", "main"]
+__all__ = ["app", "main"]
 
-# The first class that matches counts: the narrow ones come before those that hold them.
-EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
-    (errors.InvalidOptions, 2),
-    (errors.MissingDependency, 4),
-    (errors.DeviceUnavailable, 4),
-    (ModuleNotFoundError, 4),
-    (errors.ServerBusy, 5),
-    (errors.ConnectionFailed, 5),
-    (errors.InvalidRequest, 3),
-    (errors.TooLarge, 3),
-    (errors.JobCanceled, 130),
-    (OSError, 3),  # a file that is not there, or may not be written
-    (Exception, 70),
-)
+STDIO = Path("-")
 
 
 class Device(StrEnum):
@@ -67,14 +51,14 @@ class _Commands(TyperGroup):
         except Exception as error:
             if hasattr(error, "show") or ctx.params.get("traceback"):  # a usage error shows itself
                 raise
-            _complain(error)
+            complain(error)
             raise typer.Exit(exit_code(error)) from error
 
 
 app = typer.Typer(
     cls=_Commands,
     help="Clean noisy point clouds: the same points, in the same order, on the surface.",
-    epilog="Exit codes: 0 done, 2 usage, 3 bad input, 4 device or package missing, 5 busy, 70 internal.",
+    epilog="Exit codes: 0 done, 2 usage, 3 refused, 4 device or package missing, 5 busy or unreachable, 70 internal.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -87,11 +71,6 @@ def main() -> None:
     app(prog_name="straightpcf")
 
 
-def exit_code(error: Exception) -> int:
-    """Return the exit code of an error."""
-    return next(code for kind, code in EXIT_CODES if isinstance(error, kind))
-
-
 @app.callback()
 def options(
     traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error comes from.")] = False,
@@ -101,55 +80,100 @@ def options(
 
 @app.command()
 def denoise(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="The noisy cloud.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where to write the result; its suffix says how.")],
-    iterations: Annotated[str, typer.Option(metavar="auto|N", help="Passes of the filter.")] = "auto",
+    source: Annotated[Path, typer.Argument(metavar="IN", help="The noisy cloud; - for stdin.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; its suffix says how; - for stdout.")],
+    iterations: Iterations = "auto",
     device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same bytes.")] = 0,
-    strength: Annotated[float, typer.Option(help="0..1, the share of the displacement to apply.")] = 1.0,
+    seed: Seed = 0,
+    strength: Strength = 1.0,
+    format: Format = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
+    url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
+    api_key: Key = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
-    """Denoise one cloud in this process."""
-    from straightpcf.points.formats import format_for
+    """Denoise one cloud, in this process or on a server."""
+    from straightpcf.points.formats import format_for, format_named
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength))
-    output_format = None if target.suffix.lower() == source.suffix.lower() else format_for(target.name).name
-    if not source.is_file():
-        raise FileNotFoundError(f"{source} is no file")
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
-    report = _denoise_in_process(source, target, output_format, wanted, device, weights, threads)
-    if as_json:
-        _print_json(report)
-        return
-    for warning in report.warnings:
-        typer.echo(f"warning: {warning}", err=True)
-    typer.echo(
-        f"{target}: {report.points} points, {report.iterations} passes, estimated noise "
-        f"{report.noise_before:.4g} -> {report.noise_after:.4g}, {report.seconds:.1f} s",
-        err=True,
-    )
+    if format is not None:
+        format = format_named(format).name
+    elif target != STDIO and target.suffix.lower() != source.suffix.lower():
+        format = format_for(target.name).name
+    if url is not None and (device != Device.auto or weights is not None or threads is not None):
+        raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
+    with _input(source) as path, _output(target) as out:
+        name = None if source == STDIO else source.name
+        if url is not None:
+            with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
+                done = client.denoise(
+                    path if name else path.read_bytes(), out, iterations=wanted.iterations, seed=seed,
+                    strength=strength, format=format, on_progress=show,
+                )  # fmt: skip
+            report: Any = done.report
+        else:
+            report = _in_process(device, weights, threads)(path, out, name, format, wanted)
+    if as_json and target != STDIO:
+        print_json(report)
+    else:
+        show_noise(target, report)
+
+
+@app.command()
+def watch(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where clouds are put.")],
+    target: Annotated[Path | None, typer.Option("--to", help="Where results go.  [default: DIR/clean]")] = None,
+    once: Annotated[bool, typer.Option("--once", help="End when nothing is left to do; exit 3 if one failed.")] = False,
+    iterations: Iterations = "auto",
+    seed: Seed = 0,
+    strength: Strength = 1.0,
+    device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
+    url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
+    api_key: Key = None,
+) -> None:
+    """Denoise every cloud that is put into a folder, until it is interrupted."""
+    from straightpcf.clients.watch import watch_folder
+    from straightpcf.points.options import DenoiseOptions
+
+    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength))
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is no folder")
+    target = folder / "clean" if target is None else target
+    target.mkdir(parents=True, exist_ok=True)
+    if target.resolve() == folder.resolve():
+        raise errors.InvalidOptions(f"--to is {target}, the folder that is watched; results would be taken for input")
+    failures = 0
+    with _one_by_one(url, api_key, device, threads, wanted) as run:
+        for path, outcome in watch_folder(folder, target, run, once=once):
+            if isinstance(outcome, Exception):
+                failures += 1
+                typer.echo(f"{path}: ", err=True, nl=False)
+                complain(outcome)
+            else:
+                show_noise(target / path.name, outcome)
+    if failures:
+        raise typer.Exit(3)
 
 
 @app.command()
 def serve(
     host: Annotated[str | None, typer.Option(help="The address to listen on.  [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="The port; 0 for any free one.  [default: 8000]")] = None,
-    data_dir: Annotated[Path | None, typer.Option(help="Where requests are spooled.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Where jobs are kept.")] = None,
     device: Annotated[Device | None, typer.Option(help="What to compute on.  [default: auto]")] = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the worker.")] = None,
     max_bytes: Annotated[int | None, typer.Option(help="Largest request body.")] = None,
     max_points: Annotated[int | None, typer.Option(help="Largest cloud.")] = None,
-    max_jobs: Annotated[int | None, typer.Option(help="Requests held at once.")] = None,
+    max_jobs: Annotated[int | None, typer.Option(help="Jobs held at once, waiting or running.")] = None,
 ) -> None:
-    """Serve POST /denoise; every setting is also STRAIGHTPCF_<NAME> in the environment."""
+    """Serve the API and the page; every setting is also STRAIGHTPCF_<NAME> in the environment (docs/settings.md)."""
     import os
 
-    with _needs("service"):
+    with needs("service"):
         from straightpcf.service.app import serve as run_server
         from straightpcf.service.settings import Settings
 
@@ -190,7 +214,7 @@ def info(
         "max": cloud.xyz[valid].max(axis=0).tolist() if has_bounds else None,
         "fields": {name: _describe(values) for name, values in cloud.attributes.items()},
     }
-    _print_json(facts) if as_json else _print_table(facts)
+    print_json(facts) if as_json else print_table(facts)
 
 
 @app.command()
@@ -213,12 +237,13 @@ def train(
     device: Annotated[str, typer.Option(metavar="cpu|cuda")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
     init: Annotated[Path | None, typer.Option(help="The state of the stage before.")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after these, with the state saved.")] = None,
 ) -> None:
     """Train one stage; resumable, logged as CSV."""
-    with _needs("train"):
+    with needs("train"):
         from straightpcf.model.train import train as run_training
 
-    with _progress_bar(f"training {stage.value}", unit="it") as show:
+    with progress_bar(f"training {stage.value}") as show:
         run_training(
             stage.value,
             data=data,
@@ -232,6 +257,7 @@ def train(
             device=device,
             threads=threads,
             init=init,
+            minutes=minutes,
             on_step=lambda step: show(step.iteration / step.iterations, f"loss {step.loss:.3e}"),
         )
 
@@ -242,98 +268,88 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
     from straightpcf.clients.doctor import examine
 
     findings, healthy = examine()
-    _print_json(findings) if as_json else _print_table(findings)
+    print_json(findings) if as_json else print_table(findings)
     if not healthy:
         raise typer.Exit(4)
 
 
-def _denoise_in_process(
-    source: Path,
-    target: Path,
-    output_format: str | None,
-    wanted: Any,
-    device: Device,
-    weights: Path | None,
-    threads: int | None,
-) -> Any:
+job_commands.install(app)
+
+
+@contextmanager
+def _input(source: Path) -> Iterator[Path]:
+    import tempfile
+
+    if source != STDIO:
+        if not source.is_file():
+            raise FileNotFoundError(f"{source} is no file")
+        yield source
+        return
+    with tempfile.NamedTemporaryFile() as spool:  # formats are read from files, not from pipes
+        _copy(sys.stdin.buffer, spool)
+        yield Path(spool.name)
+
+
+@contextmanager
+def _output(target: Path) -> Iterator[Path]:
+    import tempfile
+
+    if target != STDIO:
+        if not target.parent.is_dir():
+            raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
+        yield target
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield (path := Path(folder) / "result")
+        with path.open("rb") as result:
+            _copy(result, sys.stdout.buffer)
+
+
+def _copy(source: BinaryIO | Any, target: BinaryIO | Any) -> None:
+    import shutil
+
+    shutil.copyfileobj(source, target)
+    target.flush()
+
+
+def _in_process(device: Device, weights: Path | None, threads: int | None) -> Callable[..., Any]:
+    """Load the filter and return what denoises one file with it."""
     from straightpcf.clients.atomic import replaced_when_complete
 
-    with _needs("model"):
+    with needs("model"):
         from straightpcf.model.filter import load_filter
         from straightpcf.service.backends.base import FileJob
         from straightpcf.service.backends.denoise_file import denoise_file
 
     denoiser = load_filter(weights, device=device.value, threads=threads)
-    with replaced_when_complete(target) as unfinished, _progress_bar(f"denoising {source.name}") as show:
-        job = FileJob(
-            id="cli",
-            source=source,
-            target=unfinished,
-            options=wanted,
-            max_points=sys.maxsize,
-            name=source.name,
-            format=output_format,
-        )
-        return denoise_file(denoiser, job, on_progress=lambda done, _: show(done))
+
+    def run(source: Path, target: Path, name: str | None, format: str | None, wanted: Any) -> Any:
+        with replaced_when_complete(target) as unfinished, progress_bar(f"denoising {name or 'stdin'}") as show:
+            job = FileJob(
+                id="cli", source=source, target=unfinished, options=wanted, max_points=sys.maxsize, name=name,
+                format=format,
+            )  # fmt: skip
+            return denoise_file(denoiser, job, on_progress=lambda done, _: show(done))
+
+    return run
 
 
 @contextmanager
-def _needs(extra: str) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as exc:
-        raise errors.MissingDependency(
-            f"{exc.name} is not installed; pip install 'straightpcf[{extra}]' brings it"
-        ) from exc
-
-
-@contextmanager
-def _progress_bar(title: str, *, unit: str = "%") -> Iterator[Callable[..., None]]:
-    """Draw on stderr, where that is a terminal; show(fraction, note) moves the bar."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(title, total=1.0, note="")
-
-        def show(fraction: float, note: str = "") -> None:
-            progress.update(task, completed=fraction, note=note)
-
-        yield show
-
-
-def _print_json(value: Any) -> None:
-    facts = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
-    typer.echo(json.dumps(facts, indent=2, default=str))
-
-
-def _print_table(facts: dict[str, Any]) -> None:
-    for name, value in facts.items():
-        if isinstance(value, dict):
-            value = ", ".join(f"{key} ({text})" for key, text in value.items()) or "none"
-        typer.echo(f"{name.replace('_', ' '):<14}{value}")
+def _one_by_one(
+    url: str | None, api_key: str | None, device: Device, threads: int | None, wanted: Any
+) -> Iterator[Callable[[Path, Path], Any]]:
+    """Lend what denoises one file into another and returns the report."""
+    if url is None:
+        run = _in_process(device, None, threads)
+        yield lambda source, target: run(source, target, source.name, None, wanted)
+        return
+    asked = {"iterations": wanted.iterations, "seed": wanted.seed, "strength": wanted.strength}
+    with job_commands.connect(url, api_key) as client:
+        yield lambda source, target: client.denoise(source, target, **asked).report
 
 
 def _describe(values: Any) -> str:
     return f"{values.dtype}" if values.ndim == 1 else f"{values.dtype} x {values.shape[1]}"
-
-
-def _complain(error: Exception) -> None:
-    if isinstance(error, errors.StraightPCFError):
-        code, text = error.code, error.message
-    elif isinstance(error, OSError):
-        code, text = errors.InvalidRequest.code, str(error)
-    else:
-        code, text = errors.InternalError.code, f"{type(error).__name__}: {error} (--traceback shows where)"
-    typer.echo(f"error [{code}]: {' '.join(text.split())}", err=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from straightpcf.points.errors import InvalidOptions
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
 ENVIRONMENT_PREFIX = "STRAIGHTPCF_"
+_OF_CLIENTS = frozenset({"STRAIGHTPCF_URL", "STRAIGHTPCF_KEY"})  # what the CLI's other commands read
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
@@ -92,7 +93,7 @@ class Settings:
         kinds = {spec.name: str(spec.type) for spec in dataclasses.fields(cls)}
         values: dict[str, Any] = {}
         for variable, text in environment.items():
-            if not variable.startswith(ENVIRONMENT_PREFIX):
+            if not variable.startswith(ENVIRONMENT_PREFIX) or variable in _OF_CLIENTS:
                 continue
             name = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
             if name not in kinds:

@@ -12,7 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 import straightpcf
-from straightpcf.clients.cli import EXIT_CODES, app, exit_code
+from straightpcf.clients.cli import app
+from straightpcf.clients.console import EXIT_CODES, exit_code
 from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment

@@ -1,0 +1,110 @@
+"""What the command line shows and how it ends: progress on stderr, tables and JSON on stdout, one line for an error.
+
+Exit codes: 0 done, 1 no result for a reason outside (the port is taken), 2 usage, 3 refused (bad input, no such job),
+4 a device or a package is missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted or canceled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from straightpcf.points import errors
+
+__all__ = ["EXIT_CODES", "complain", "exit_code", "needs", "print_json", "print_table", "progress_bar", "show_noise"]
+
+# The first class that matches counts: the narrow ones come before those that hold them.
+EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
+    (errors.InvalidOptions, 2),
+    (errors.MissingDependency, 4),
+    (errors.DeviceUnavailable, 4),
+    (ModuleNotFoundError, 4),
+    (errors.ServerBusy, 5),
+    (errors.ConnectionFailed, 5),
+    (errors.JobNotFinished, 5),
+    (errors.JobCanceled, 130),
+    (errors.InternalError, 70),
+    (errors.StraightPCFError, 3),
+    (OSError, 3),  # a file that is not there, or may not be written
+    (Exception, 70),
+)
+
+
+def exit_code(error: Exception) -> int:
+    """Return the exit code of an error."""
+    return next(code for kind, code in EXIT_CODES if isinstance(error, kind))
+
+
+def complain(error: Exception) -> None:
+    """Say on stderr, in one line, what is wrong."""
+    if isinstance(error, errors.StraightPCFError):
+        code, text = error.code, error.message
+    elif isinstance(error, OSError):
+        code, text = errors.InvalidRequest.code, str(error)
+    else:
+        code, text = errors.InternalError.code, f"{type(error).__name__}: {error} (--traceback shows where)"
+    typer.echo(f"error [{code}]: {' '.join(text.split())}", err=True)
+
+
+@contextmanager
+def needs(extra: str) -> Iterator[None]:
+    """Name the extra that brings what an import inside misses."""
+    try:
+        yield
+    except ModuleNotFoundError as exc:
+        raise errors.MissingDependency(
+            f"{exc.name} is not installed; pip install 'straightpcf[{extra}]' brings it"
+        ) from exc
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """Draw on stderr, where that is a terminal; show(fraction, note) moves the bar."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(title, total=1.0, note="")
+
+        def show(fraction: float, note: str = "") -> None:
+            progress.update(task, completed=fraction, note=note)
+
+        yield show
+
+
+def print_json(value: Any) -> None:
+    """Print a value, or a dataclass, on stdout."""
+    facts = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
+    typer.echo(json.dumps(facts, indent=2, default=str))
+
+
+def print_table(facts: dict[str, Any]) -> None:
+    """Print names and values, a line each, on stdout."""
+    for name, value in facts.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{key} ({text})" for key, text in value.items()) or "none"
+        typer.echo(f"{name.replace('_', ' '):<14}{value}")
+
+
+def show_noise(target: object, report: Any) -> None:
+    """Sum up on stderr what was done; report: of the SDK or of a worker, they have the same names."""
+    for warning in report.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(
+        f"{target}: {report.points} points, {report.iterations} passes, estimated noise "
+        f"{report.noise_before:.4g} -> {report.noise_after:.4g}, {report.seconds:.1f} s",
+        err=True,
+    )

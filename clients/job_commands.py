@@ -1,0 +1,165 @@
+"""The commands that talk to a server about jobs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from straightpcf.clients.console import print_json, print_table, progress_bar, show_noise
+from straightpcf.points.errors import InvalidOptions
+
+if TYPE_CHECKING:
+    from straightpcf.clients.sdk import Client, JobInfo
+
+__all__ = ["Format", "Iterations", "Key", "Seed", "Strength", "Url", "connect", "install"]
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+Url = Annotated[str, typer.Option("--url", envvar="STRAIGHTPCF_URL", metavar="URL", help="Where the server is.")]
+Key = Annotated[str | None, typer.Option("--api-key", envvar="STRAIGHTPCF_KEY", help="A key of the server.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Id = Annotated[str, typer.Argument(metavar="ID", help="The job.")]
+Iterations = Annotated[str, typer.Option(metavar="auto|N", help="Passes of the filter.")]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
+Strength = Annotated[float, typer.Option(help="0..1, the share of the displacement to apply.")]
+Format = Annotated[str | None, typer.Option("--format", help="Of the result (ply, xyz, ...); else the input's.")]
+
+
+def install(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    for command in (submit, status, wait, cancel, jobs, result):
+        app.command()(command)
+
+
+@contextmanager
+def connect(url: str, api_key: str | None) -> Iterator[Client]:
+    """Open a client."""
+    if not url.startswith(("http://", "https://")):
+        raise InvalidOptions(f"--url is {url[:80]!r}; it must begin with http:// or https://")
+    from straightpcf.clients.sdk import Client
+
+    with Client(url, api_key=api_key) as client:
+        yield client
+
+
+def submit(
+    sources: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The noisy clouds; - for stdin.")],
+    iterations: Iterations = "auto",
+    seed: Seed = 0,
+    strength: Strength = 1.0,
+    format: Format = None,
+    id: Annotated[str | None, typer.Option(help="A name for the job, to make it only once.")] = None,
+    url: Url = DEFAULT_URL,
+    api_key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Hand clouds to a server and print their jobs' ids; the jobs outlive this command."""
+    if id is not None and len(sources) > 1:
+        raise InvalidOptions(f"--id names one job, and there are {len(sources)} files")
+    with connect(url, api_key) as client:
+        for source in sources:
+            content: Any = sys.stdin.buffer.read() if str(source) == "-" else source
+            job = client.jobs.create(
+                content, iterations=iterations, seed=seed, strength=strength, format=format, id=id  # type: ignore[arg-type]
+            )  # fmt: skip
+            print_json(job.info.json) if as_json else typer.echo(job.id)
+
+
+def status(id: Id, url: Url = DEFAULT_URL, api_key: Key = None, as_json: AsJson = False) -> None:
+    """Show a job."""
+    with connect(url, api_key) as client:
+        _show(client.jobs.get(id).info, as_json)
+
+
+def wait(
+    id: Id,
+    timeout: Annotated[float | None, typer.Option(min=0, help="Seconds; exit 5 when they are over.")] = None,
+    url: Url = DEFAULT_URL,
+    api_key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Wait for a job's end; the exit code tells how it ended."""
+    with connect(url, api_key) as client, progress_bar(id) as show:
+        info = client.jobs.get(id).wait(timeout=timeout, on_progress=show)
+    _show(info, as_json)
+    if info.failure is not None:
+        raise info.failure
+
+
+def cancel(
+    ids: Annotated[list[str], typer.Argument(metavar="ID...")],
+    url: Url = DEFAULT_URL,
+    api_key: Key = None,
+) -> None:
+    """End jobs that wait or run."""
+    with connect(url, api_key) as client:
+        for id in ids:
+            typer.echo(f"{id} {client.jobs.get(id).cancel().state}")
+
+
+def jobs(
+    state: Annotated[list[str] | None, typer.Option(help="Only these; may be repeated.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="How many, newest first.")] = 20,
+    url: Url = DEFAULT_URL,
+    api_key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """List jobs, newest first."""
+    from straightpcf.clients.sdk.job_info import STATES
+
+    if unknown := set(state or ()) - set(STATES):
+        raise InvalidOptions(f"--state is {min(unknown)!r}; it must be one of {', '.join(STATES)}")
+    with connect(url, api_key) as client:
+        found = client.jobs.list(states=state or (), page_size=min(limit, 200))  # type: ignore[arg-type]
+        infos = [job.info for _, job in zip(range(limit), found, strict=False)]
+    if as_json:
+        print_json([info.json for info in infos])
+        return
+    for info in infos:
+        points = "" if info.points is None else f"{info.points:,} points"
+        when = info.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+        typer.echo(f"{info.id:<34}{info.state:<12}{info.progress:>5.0%}  {when}  {info.name or '-'}  {points}".rstrip())
+
+
+def result(
+    id: Id,
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where to write it; - for stdout.")],
+    url: Url = DEFAULT_URL,
+    api_key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Wait for a job and download its result, whole and checked."""
+    with connect(url, api_key) as client, progress_bar(id) as show:
+        job = client.jobs.get(id)
+        if not job.info.finished:
+            job.wait(on_progress=show)
+        to_stdout = str(target) == "-"
+        found = job.result(None if to_stdout else target)
+        if to_stdout:
+            sys.stdout.buffer.write(found.read())
+    if as_json and not to_stdout:
+        print_json(found.job.json["report"])
+    else:
+        show_noise(target, found.report)
+
+
+def _show(info: JobInfo, as_json: bool) -> None:
+    if as_json:
+        print_json(info.json)
+        return
+    facts: dict[str, Any] = {"job": info.id, "state": info.state, "progress": f"{info.progress:.0%}"}
+    facts |= {"name": info.name, "points": info.points, "position": info.position, "attempts": info.attempts}
+    if info.report is not None:
+        facts |= {
+            "passes": info.report.iterations,
+            "noise": f"{info.report.noise_before:.4g} -> {info.report.noise_after:.4g}",
+            "seconds": f"{info.report.seconds:.1f}",
+        }
+    if info.failure is not None:
+        facts["error"] = f"[{info.failure.code}] {info.failure.message}"
+    print_table({name: value for name, value in facts.items() if value is not None})

@@ -1,0 +1,124 @@
+"""The commands that talk to a server, and the folder that is watched, as their users start them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clouds import noisy, sphere, torus
+from tests.conftest import RunningServer, clean_environment
+
+POINTS = 400
+
+
+def cli(server: RunningServer | None, *arguments: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
+    environment = clean_environment() | ({} if server is None else {"STRAIGHTPCF_URL": server.url})
+    return subprocess.run(command, capture_output=True, check=False, env=environment, timeout=120, input=stdin)
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    np.save(path := tmp_path / "scan.npy", noisy(torus(POINTS), 0.01).astype(np.float32))
+    return path
+
+
+def test_submit_wait_status_result_jobs_cancel(server: RunningServer, scan: Path) -> None:
+    done = cli(server, "submit", scan, "--iterations", "1")
+    assert done.returncode == 0, done.stderr
+    id = done.stdout.decode().strip()
+    assert cli(server, "wait", id).returncode == 0
+    assert b"succeeded" in cli(server, "status", id).stdout
+    job = json.loads(cli(server, "status", id, "--json").stdout)
+    assert (job["id"], job["state"], job["name"]) == (id, "succeeded", "scan.npy")
+    done = cli(server, "result", id, scan.with_name("clean.npy"))
+    assert b"estimated noise" in done.stderr
+    assert np.load(scan.with_name("clean.npy")).shape == (POINTS, 3)
+    assert cli(server, "result", id, "-").stdout == scan.with_name("clean.npy").read_bytes()
+    assert id in cli(server, "jobs").stdout.decode().splitlines()[0]
+    assert json.loads(cli(server, "jobs", "--json", "--limit", 1).stdout)[0]["id"] == id
+    assert cli(server, "cancel", id).stdout.decode() == f"{id} succeeded\n"
+
+
+def test_a_job_that_fails_gives_wait_the_exit_code_of_its_error(server: RunningServer, tmp_path: Path) -> None:
+    np.save(tmp_path / "few.npy", sphere(5))
+    id = cli(server, "submit", tmp_path / "few.npy", "--id", "few").stdout.decode().strip()
+    assert id == "few"
+    done = cli(server, "wait", id)
+    assert done.returncode == 3
+    assert b"error [too_few_points]" in done.stderr
+    assert b"failed" in done.stdout
+    assert cli(server, "result", id, tmp_path / "x.npy").returncode == 3
+    assert not (tmp_path / "x.npy").exists()
+
+
+def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, tmp_path: Path) -> None:
+    np.save(tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    for arguments, code, text in (
+        (("status", "no-such-job"), 3, "not_found"),
+        (("jobs", "--state", "gone"), 2, "invalid_options"),
+        (("jobs", "--url", "ftp://x"), 2, "invalid_options"),
+        (("denoise", tmp_path / "large.npy", tmp_path / "c.npy", "--url", server.url, "--device", "cpu"), 2, "device"),
+    ):
+        done = cli(server, *arguments)
+        assert (done.returncode, done.stderr.count(b"\n")) == (code, 1), done.stderr
+        assert text in done.stderr.decode()
+    id = cli(server, "submit", tmp_path / "large.npy").stdout.decode().strip()
+    assert cli(server, "wait", id, "--timeout", 0.2).returncode == 5
+    assert cli(server, "cancel", id).stdout.decode() == f"{id} canceled\n"
+    assert cli(server, "wait", id).returncode == 130
+
+
+def test_denoise_on_a_server_gives_the_bytes_of_this_process(server: RunningServer, scan: Path) -> None:
+    here, there = scan.with_name("here.npy"), scan.with_name("there.npy")
+    assert cli(None, "denoise", scan, here, "--iterations", 1, "--device", "cpu").returncode == 0
+    done = cli(None, "denoise", scan, there, "--iterations", 1, "--url", server.url, "--json")
+    assert json.loads(done.stdout)["points"] == POINTS
+    assert here.read_bytes() == there.read_bytes()
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_a_dash_is_stdin_and_stdout(server: RunningServer, scan: Path, remote: bool) -> None:
+    where = ("--url", server.url) if remote else ("--device", "cpu")
+    piped = cli(None, "denoise", "-", "-", "--iterations", 1, *where, stdin=scan.read_bytes())
+    assert piped.returncode == 0, piped.stderr
+    target = scan.with_name("clean.npy")
+    cli(None, "denoise", scan, target, "--iterations", 1, *where)
+    assert piped.stdout == target.read_bytes()
+    as_text = cli(None, "denoise", "-", "-", "--iterations", 1, "--format", "xyz", *where, stdin=scan.read_bytes())
+    assert len(as_text.stdout.splitlines()) == POINTS
+
+
+def test_watch_once_does_what_is_there_and_tells_what_failed(scan: Path) -> None:
+    np.save(scan.with_name("few.npy"), sphere(5))
+    (scan.parent / "notes.md").write_text("no cloud")
+    done = cli(None, "watch", scan.parent, "--once", "--iterations", 1, "--device", "cpu")
+    assert done.returncode == 3
+    assert b"few.npy: error [too_few_points]" in done.stderr
+    assert sorted(path.name for path in (scan.parent / "clean").iterdir()) == ["scan.npy"]
+    assert cli(None, "watch", scan.parent, "--once", "--to", scan.parent).returncode == 2
+
+
+def test_watch_takes_what_comes_later_from_a_server(server: RunningServer, scan: Path, tmp_path: Path) -> None:
+    (folder := tmp_path / "in").mkdir()
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "watch", str(folder), "--iterations", "1"]
+    process = subprocess.Popen([*command, "--url", server.url], env=clean_environment(), stderr=subprocess.PIPE)
+    try:
+        (folder / "late.npy").write_bytes(scan.read_bytes())
+        deadline = time.monotonic() + 60
+        while not (folder / "clean" / "late.npy").exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert np.load(folder / "clean" / "late.npy").shape == (POINTS, 3)
+    finally:
+        os.kill(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert b"late.npy: 400 points" in said
