@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -47,6 +48,16 @@ class RunningServer:
     def spooled_files(self) -> list[Path]:
         folders = (self.data_dir / "jobs", self.data_dir / "incoming")
         return [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+
+    def delete_jobs(self) -> None:
+        """Delete every job, running or not; its files are gone when the answer comes."""
+        while jobs := json.loads(self._ask("GET", "/jobs"))["jobs"]:
+            for job in jobs:
+                self._ask("DELETE", f"/jobs/{job['id']}")
+
+    def _ask(self, method: str, path: str) -> bytes:
+        with urllib.request.urlopen(urllib.request.Request(self.url + path, method=method), timeout=20) as response:
+            return bytes(response.read())
 
     def _status(self, path: str) -> int:
         try:
@@ -102,8 +113,9 @@ def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningS
 
 @pytest.fixture
 def server(shared_server: RunningServer) -> RunningServer:
-    """A server that is ready, whatever the test before did to it."""
+    """A server that is ready and holds no job, whatever the test before did to it."""
     shared_server.wait_until_ready()
+    shared_server.delete_jobs()
     return shared_server
 
 
