@@ -21,7 +21,7 @@ COPY model model
 COPY service service
 COPY clients clients
 # The image does not know its processor: carry the kernels for each instruction set.
-RUN /venv/bin/pip install --no-cache-dir ".[service,las]" \
+RUN /venv/bin/pip install --no-cache-dir ".[service,grpc,las]" \
     && /venv/bin/python -c "from pathlib import Path; from straightpcf.model.kernels import cpu; cpu.build_all(Path(cpu.__file__).with_name('lib'))"
 
 FROM python:${PYTHON}-slim
@@ -34,9 +34,10 @@ COPY --from=build /venv /venv
 USER 10001
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
-    STRAIGHTPCF_DATA_DIR=/data
+    STRAIGHTPCF_DATA_DIR=/data \
+    STRAIGHTPCF_GRPC_PORT=50051
 VOLUME /data
-EXPOSE 8000
+EXPOSE 8000 50051
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
     CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/readyz', timeout=2)"]
 ENTRYPOINT ["straightpcf"]

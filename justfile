@@ -14,3 +14,8 @@ serve:
 
 quality *ARGS:
     .venv/bin/python -m benchmarks.quality --split punet {{ARGS}}
+
+# the gRPC stubs, which are committed
+proto:
+    .venv/bin/python -m grpc_tools.protoc -I src --python_out=src --pyi_out=src --grpc_python_out=src \
+        straightpcf/points/wire/straightpcf.proto

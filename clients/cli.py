@@ -162,6 +162,7 @@ def watch(
 def serve(
     host: Annotated[str | None, typer.Option(help="The address to listen on.  [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="The port; 0 for any free one.  [default: 8000]")] = None,
+    grpc_port: Annotated[int | None, typer.Option(help="Serve gRPC too, on this port.  [default: no gRPC]")] = None,
     data_dir: Annotated[Path | None, typer.Option(help="Where jobs are kept.")] = None,
     device: Annotated[Device | None, typer.Option(help="What to compute on.  [default: auto]")] = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
@@ -181,6 +182,7 @@ def serve(
         os.environ,
         host=host,
         port=port,
+        grpc_port=grpc_port,
         data_dir=data_dir,
         device=None if device is None else device.value,
         weights=weights,

@@ -7,12 +7,14 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import uvicorn
 from fastapi import Depends, FastAPI
 from starlette.middleware.cors import CORSMiddleware
 
 import straightpcf
+from straightpcf.points.errors import MissingDependency
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
@@ -28,6 +30,9 @@ from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 from straightpcf.service.web import install_page
 
+if TYPE_CHECKING:
+    from straightpcf.service.api.grpc import GrpcServer
+
 __all__ = ["create_app", "serve"]
 
 logger = logging.getLogger("uvicorn.error")
@@ -37,12 +42,20 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     """Wire one server together; nothing starts before the app's lifespan does."""
     engine = Engine(backend or _local_backend(settings), limits=_limits(settings), data_dir=settings.data_dir)
 
+    telemetry = Telemetry(engine)
+    gate = Gate(settings.keys(), rate_per_minute=settings.rate_per_minute)
+    grpc = _grpc_server(settings, engine, gate, telemetry)
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await engine.start()
         try:
+            if grpc is not None:
+                await grpc.start()
             yield
         finally:
+            if grpc is not None:
+                await grpc.stop(patience_seconds=settings.shutdown_seconds)
             await engine.stop()
 
     app = FastAPI(
@@ -51,10 +64,9 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         summary="Hand it a noisy point cloud, get the same points back on the surface.",
         lifespan=lifespan,
     )
-    telemetry = Telemetry(engine)
     app.state.engine = engine
-    app.state.gate = Gate(settings.keys(), rate_per_minute=settings.rate_per_minute)
-    app.state.weights = settings.weights.name if settings.weights else "shipped"
+    app.state.gate = gate
+    app.state.weights = _weights_name(settings)
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
     if origins := [origin.strip() for origin in settings.cors_origins.split(",") if origin.strip()]:
@@ -112,6 +124,27 @@ class _Server(uvicorn.Server):
         """Begin to shut down."""
         self._engine.drain()
         super().handle_exit(sig, frame)
+
+
+def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Telemetry) -> GrpcServer | None:
+    if settings.grpc_port is None:
+        return None
+    try:
+        from straightpcf.service.api.grpc import GrpcServer
+    except ImportError as exc:
+        raise MissingDependency(f"gRPC needs an extra: pip install 'straightpcf[grpc]' ({exc})") from exc
+    return GrpcServer(
+        engine,
+        gate=gate,
+        telemetry=telemetry,
+        weights=_weights_name(settings),
+        host=settings.host,
+        port=settings.grpc_port,
+    )
+
+
+def _weights_name(settings: Settings) -> str:
+    return settings.weights.name if settings.weights else "shipped"
 
 
 def _is_loopback(host: str) -> bool:

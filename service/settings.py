@@ -28,6 +28,7 @@ def _default_data_dir() -> Path:
 class Settings:
     """Configure one server; each field is STRAIGHTPCF_<NAME> in the environment.
 
+    grpc_port: None for no gRPC. 0, here and for port: any free one.
     max_bytes: of one request body.  max_points: of one cloud.
     max_jobs, max_queued_points: waiting and running at once, over all keys; more are answered "busy".
     max_jobs_per_key: waiting and running for one key.  rate_per_minute: requests of one key, 0 for any number.
@@ -42,6 +43,7 @@ class Settings:
 
     host: str = "127.0.0.1"
     port: int = 8000
+    grpc_port: int | None = None
     data_dir: Path = field(default_factory=_default_data_dir)
     max_bytes: int = 512 * 2**20
     max_points: int = 5_000_000
@@ -71,8 +73,9 @@ class Settings:
         for name in ("rate_per_minute", "min_free_bytes", "row_ttl_seconds"):
             if getattr(self, name) < 0:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must not be negative")
-        if not 0 <= self.port < 2**16:
-            raise InvalidOptions(f"port is {self.port}; it must be in 0..65535 (0: any free one)")
+        for name in ("port", "grpc_port"):
+            if not 0 <= (getattr(self, name) or 0) < 2**16:
+                raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
 
     def keys(self) -> tuple[str, ...]:
         """Return the API keys; raises InvalidOptions where their file cannot be read or holds none."""

@@ -30,6 +30,9 @@ class Telemetry:
             "straightpcf_http_request_seconds", "From request to the end of the answer.", ("method", "route"),
             buckets=(0.005, 0.02, 0.1, 0.5, 1, 2, 5, 10, 30, 60, 300), registry=self.registry,
         )  # fmt: skip
+        self.grpc_requests = Counter(
+            "straightpcf_grpc_requests", "Calls answered.", ("method", "status"), registry=self.registry
+        )
         self.registry.register(_EngineCollector(engine))
 
     async def endpoint(self, request: Request) -> Response:

@@ -45,6 +45,12 @@ class RunningServer:
             time.sleep(0.1)
         raise AssertionError(f"not ready within {START_SECONDS} s:\n{self.log.read_text()}")
 
+    @property
+    def grpc_url(self) -> str:
+        found = re.search(r"gRPC on (\S+)", self.log.read_text())
+        assert found, "start it with --grpc-port 0"
+        return f"grpc://{found[1]}"
+
     def spooled_files(self) -> list[Path]:
         folders = (self.data_dir / "jobs", self.data_dir / "incoming")
         return [path for folder in folders for path in folder.rglob("*") if path.is_file()]
@@ -106,7 +112,7 @@ def _url_in(log: Path, process: subprocess.Popen[bytes]) -> str:
 
 @pytest.fixture(scope="session")
 def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
-    with run_server(tmp_path_factory.mktemp("server")) as server:
+    with run_server(tmp_path_factory.mktemp("server"), "--grpc-port", "0") as server:
         server.wait_until_ready()
         yield server
 

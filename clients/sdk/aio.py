@@ -14,10 +14,10 @@ from straightpcf.clients.sdk.flows import OnProgress
 from straightpcf.clients.sdk.job_info import JobInfo, JobState
 from straightpcf.clients.sdk.receive import Events, Patches
 from straightpcf.clients.sdk.request import Iterations, Source, events_call, patches_call
-from straightpcf.clients.sdk.response import Health, ServerInfo, parse_health, parse_info
+from straightpcf.clients.sdk.response import Health, ServerInfo
 from straightpcf.clients.sdk.result import Denoised
 from straightpcf.clients.sdk.retry import MAX_RETRIES
-from straightpcf.clients.sdk.transport import AsyncTransport
+from straightpcf.clients.sdk.transport import AsyncTransport, connect_async
 from straightpcf.points.wire.patches import PatchFrame
 
 __all__ = ["AsyncClient", "AsyncJob", "AsyncJobs"]
@@ -34,7 +34,7 @@ class AsyncClient:
         timeout: float | None = DEFAULT_TIMEOUT_SECONDS,
         max_retries: int = MAX_RETRIES,
     ) -> None:
-        self._transport = AsyncTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+        self._transport = connect_async(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.jobs = AsyncJobs(self._transport)
 
     async def __aenter__(self) -> Self:
@@ -68,11 +68,11 @@ class AsyncClient:
 
     async def health(self) -> Health:
         """Do as `Client.health`."""
-        return await self._transport.run(flows.read("/healthz", parse_health))
+        return await self._transport.run(flows.health())
 
     async def info(self) -> ServerInfo:
         """Do as `Client.info`."""
-        return await self._transport.run(flows.read("/v1/info", parse_info))
+        return await self._transport.run(flows.info())
 
 
 class AsyncJobs:

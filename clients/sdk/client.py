@@ -13,10 +13,10 @@ from straightpcf.clients.sdk.flows import OnProgress
 from straightpcf.clients.sdk.job_info import JobInfo, JobState
 from straightpcf.clients.sdk.receive import Events, Patches
 from straightpcf.clients.sdk.request import Iterations, Source, events_call, patches_call
-from straightpcf.clients.sdk.response import Health, ServerInfo, parse_health, parse_info
+from straightpcf.clients.sdk.response import Health, ServerInfo
 from straightpcf.clients.sdk.result import Denoised
 from straightpcf.clients.sdk.retry import MAX_RETRIES
-from straightpcf.clients.sdk.transport import Transport
+from straightpcf.clients.sdk.transport import Transport, connect
 from straightpcf.points.wire.patches import PatchFrame
 
 __all__ = ["DEFAULT_TIMEOUT_SECONDS", "Client", "Job", "Jobs"]
@@ -27,7 +27,8 @@ DEFAULT_TIMEOUT_SECONDS = 60.0  # of silence: a server that works says something
 class Client:
     """Call a server from ordinary code; use it as a context manager or close it.
 
-    url: where the server is, "http://127.0.0.1:8000". api_key: sent as a bearer token.
+    url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
+    api_key: sent as a bearer token.
     timeout: seconds of silence that are borne, None for any.
     max_retries: of a busy server and of a broken connection; every other error is raised at once.
     """
@@ -40,7 +41,7 @@ class Client:
         timeout: float | None = DEFAULT_TIMEOUT_SECONDS,
         max_retries: int = MAX_RETRIES,
     ) -> None:
-        self._transport = Transport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+        self._transport = connect(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.jobs = Jobs(self._transport)
 
     def __enter__(self) -> Self:
@@ -79,11 +80,11 @@ class Client:
 
     def health(self) -> Health:
         """Ask whether the server is there, and warm."""
-        return self._transport.run(flows.read("/healthz", parse_health))
+        return self._transport.run(flows.health())
 
     def info(self) -> ServerInfo:
         """Ask what the server is and takes."""
-        return self._transport.run(flows.read("/v1/info", parse_info))
+        return self._transport.run(flows.info())
 
 
 class Jobs:

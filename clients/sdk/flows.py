@@ -17,6 +17,7 @@ from straightpcf.clients.sdk.events import Progress
 from straightpcf.clients.sdk.job_info import JobInfo
 from straightpcf.clients.sdk.receive import Body, Events, Receiver
 from straightpcf.clients.sdk.request import Call, Source
+from straightpcf.clients.sdk.response import Health, ServerInfo, parse_health, parse_info
 from straightpcf.clients.sdk.result import Denoised
 from straightpcf.points.errors import JobNotFinished, StraightPCFError
 
@@ -30,8 +31,9 @@ __all__ = [
     "denoise",
     "fetch",
     "get",
+    "health",
+    "info",
     "page",
-    "read",
     "wait",
 ]
 
@@ -44,9 +46,14 @@ Flow: TypeAlias = Generator[Step, Any, _T]
 OnProgress: TypeAlias = Callable[[float], object]
 
 
-def read(path: str, parse: Callable[[Any], _T]) -> Flow[_T]:
-    """Read one document."""
-    return (yield request.get_call(path), Body(parse))  # type: ignore[no-any-return]
+def health() -> Flow[Health]:
+    """Ask how the server is."""
+    return (yield request.get_call("/healthz", "GetHealth"), Body(parse_health))  # type: ignore[no-any-return]
+
+
+def info() -> Flow[ServerInfo]:
+    """Ask what the server is."""
+    return (yield request.get_call("/v1/info", "GetServerInfo"), Body(parse_info))  # type: ignore[no-any-return]
 
 
 def get(id: str) -> Flow[JobInfo]:
@@ -57,7 +64,7 @@ def get(id: str) -> Flow[JobInfo]:
 def page(states: Collection[str], limit: int, cursor: str | None) -> Flow[tuple[list[JobInfo], str | None]]:
     """Return a page of jobs and the cursor of the next one."""
     body = yield request.list_call(states, limit, cursor), Body()
-    return [JobInfo.parse(job) for job in body["jobs"]], body["next_cursor"]
+    return [JobInfo.parse(job) for job in body["jobs"]], body["next_cursor"] or None
 
 
 def create(source: Source, **wanted: Any) -> Flow[JobInfo]:

@@ -1,4 +1,4 @@
-"""Turn what a user asks for into one HTTP request; touches no network."""
+"""Turn what a user asks for into one request, as HTTP and as gRPC have it; touches no network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import uuid
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal, TypeAlias
 from urllib.parse import quote
@@ -21,6 +21,7 @@ from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 
 __all__ = [
+    "CHUNK_BYTES",
     "Call",
     "Iterations",
     "Source",
@@ -46,12 +47,15 @@ Iterations: TypeAlias = int | Literal["auto"]
 class Call:
     """Describe one request; the body can be opened again for every attempt.
 
+    rpc, fields: the same as a call of the gRPC service, in the JSON form of its message.
     request_id: names the request in the server's log, the same for every attempt.
     timeout: seconds of silence to bear, None for the client's own. events: the answer is a stream of events.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
     path: str
+    rpc: str
+    fields: Mapping[str, Any] = field(default_factory=dict)
     params: Mapping[str, str | list[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | Path | None = None
@@ -112,18 +116,21 @@ def upload_call(
         "Content-Length": str(size),
         **({} if key is None else {"Idempotency-Key": key}),
     }
+    id = id or uuid.uuid4().hex
+    fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id}
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
-    return Call(method="PUT", path=_job(id or uuid.uuid4().hex), params=params, headers=headers, body=body)
+    return Call(method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body)
 
 
-def get_call(path: str) -> Call:
+def get_call(path: str, rpc: str) -> Call:
     """Build a plain GET."""
-    return Call(method="GET", path=path)
+    return Call(method="GET", path=path, rpc=rpc)
 
 
 def job_call(id: str, *, wait: float = 0.0) -> Call:
     """Build the request that looks at a job, `wait` seconds long if it is not finished."""
-    return Call(method="GET", path=_job(id), params={"wait": f"{wait:g}"} if wait > 0 else {})
+    params = {"wait": f"{wait:g}"} if wait > 0 else {}
+    return Call(method="GET", path=_job(id), rpc="GetJob", fields={"id": id, "wait_seconds": wait}, params=params)
 
 
 def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
@@ -133,33 +140,38 @@ def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
         params["state"] = list(states)
     if cursor is not None:
         params["cursor"] = cursor
-    return Call(method="GET", path="/jobs", params=params)
+    fields = {"states": list(states), "limit": limit, "cursor": cursor}
+    return Call(method="GET", path="/jobs", rpc="ListJobs", fields=fields, params=params)
 
 
 def events_call(id: str) -> Call:
     """Build the request that follows a job."""
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
-    return Call(method="GET", path=_job(id, "events"), headers=headers, events=True)
+    path = _job(id, "events")
+    return Call(method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True)
 
 
 def patches_call(id: str) -> Call:
     """Build the request for the patch stream."""
-    return Call(method="GET", path=_job(id, "stream"), headers={"Accept": PATCHES_MEDIA_TYPE})
+    headers = {"Accept": PATCHES_MEDIA_TYPE}
+    return Call(method="GET", path=_job(id, "stream"), rpc="StreamPatches", fields={"id": id}, headers=headers)
 
 
 def result_call(id: str) -> Call:
     """Build the request for a result."""
-    return Call(method="GET", path=_job(id, "result"), headers={"Accept-Encoding": "identity"})
+    headers = {"Accept-Encoding": "identity"}
+    return Call(method="GET", path=_job(id, "result"), rpc="DownloadResult", fields={"id": id}, headers=headers)
 
 
 def cancel_call(id: str) -> Call:
     """Build the request that ends a job."""
-    return Call(method="POST", path=_job(id, "cancel"))
+    return Call(method="POST", path=_job(id, "cancel"), rpc="CancelJob", fields={"id": id})
 
 
 def delete_call(id: str, *, timeout: float | None = None) -> Call:
     """Build the request that removes a job; with a timeout it is tried once."""
-    return Call(method="DELETE", path=_job(id), timeout=timeout, once=timeout is not None)
+    once = timeout is not None
+    return Call(method="DELETE", path=_job(id), rpc="DeleteJob", fields={"id": id}, timeout=timeout, once=once)
 
 
 def _job(id: str, part: str = "") -> str:

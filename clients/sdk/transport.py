@@ -1,38 +1,82 @@
-"""Carry requests over HTTP, again where that helps: the only part of the SDK that touches the network."""
+"""Run flows over some wire, again where that helps: what every transport has in common."""
 
 from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Iterator
-from typing import Any, TypeVar
-
-import httpx2
+from typing import TypeVar
 
 from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
-from straightpcf.clients.sdk.response import failed_connection, failed_response
 from straightpcf.clients.sdk.retry import Failure, next_delay
 
-__all__ = ["CONNECT_TIMEOUT_SECONDS", "AsyncTransport", "Transport"]
-
-CONNECT_TIMEOUT_SECONDS = 10.0
-_FAULTS = (httpx2.TransportError, httpx2.SSEError)
+__all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async"]
 
 _T = TypeVar("_T")
 
 
-class Transport:
+def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> Transport:
+    """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`."""
+    if _is_grpc(url):
+        from straightpcf.clients.sdk.grpc_transport import GrpcTransport
+
+        return GrpcTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+    from straightpcf.clients.sdk.http_transport import HttpTransport
+
+    return HttpTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+
+
+def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> AsyncTransport:
+    """Do as `connect`."""
+    if _is_grpc(url):
+        from straightpcf.clients.sdk.grpc_transport import AsyncGrpcTransport
+
+        return AsyncGrpcTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+    from straightpcf.clients.sdk.http_transport import AsyncHttpTransport
+
+    return AsyncHttpTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+
+
+def _is_grpc(url: str) -> bool:
+    return url.startswith(("grpc://", "grpcs://"))
+
+
+class Attempts:
+    """Count the attempts of one request, anew whenever one of them got on; `failure` is what the last one met."""
+
+    def __init__(self, call: Call, receiver: Receiver, max_retries: int) -> None:
+        self._receiver = receiver
+        self._max_retries = 0 if call.once else max_retries
+        self._attempt, self._furthest = 0, receiver.furthest
+        self.failure: Failure | None = None
+
+    def delay(self) -> float:
+        """Return the seconds to wait before the next attempt, or raise what the last one met."""
+        assert self.failure is not None
+        if self._receiver.furthest > self._furthest:
+            self._attempt, self._furthest = 0, self._receiver.furthest
+        delay = next_delay(self.failure, attempt=self._attempt, max_retries=self._max_retries)
+        if delay is None:
+            raise self.failure.error from self.failure.cause
+        self._attempt += 1
+        return delay
+
+
+class Transport(ABC):
     """Run flows in ordinary code."""
 
-    def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self._max_retries = max_retries
-        self._http = httpx2.Client(**_options(url, api_key, timeout))
+    max_retries: int
 
+    @abstractmethod
     def close(self) -> None:
         """Close the connections."""
-        self._http.close()
+
+    @abstractmethod
+    def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
+        """Make one request, yield whenever something came, and leave what is missing in `attempts.failure`."""
 
     def run(self, flow: Flow[_T]) -> _T:
         """Do what a flow asks for, request by request; return what it returns, raise what it raises."""
@@ -51,37 +95,26 @@ class Transport:
 
     def stream(self, step: Step) -> Iterator[None]:
         """Make one request until its receiver has it all, and yield whenever something came; raises its error."""
-        call, receiver = step
-        attempts = _Attempts(call, receiver, self._max_retries)
+        attempts = Attempts(*step, self.max_retries)
         while True:
-            try:
-                with call.open_body() as body, self._http.stream(**_request(call, receiver), content=body) as response:
-                    if response.is_success:
-                        receiver.begin(response.status_code, response.headers)
-                        for item in httpx2.EventSource(response) if call.events else response.iter_bytes():
-                            receiver.write(item)
-                            yield
-                        failure = receiver.finish()
-                    else:
-                        response.read()
-                        failure = failed_response(response)
-            except _FAULTS as fault:
-                failure = failed_connection(fault, self._http.base_url)
-            if failure is None:
+            yield from self.attempt(*step, attempts)
+            if attempts.failure is None:
                 return
-            time.sleep(attempts.delay_after(failure))
+            time.sleep(attempts.delay())
 
 
-class AsyncTransport:
+class AsyncTransport(ABC):
     """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
 
-    def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self._max_retries = max_retries
-        self._http = httpx2.AsyncClient(**_options(url, api_key, timeout))
+    max_retries: int
 
+    @abstractmethod
     async def close(self) -> None:
         """Close the connections."""
-        await self._http.aclose()
+
+    @abstractmethod
+    def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
+        """Do as `Transport.attempt`."""
 
     async def run(self, flow: Flow[_T]) -> _T:
         """Do as `Transport.run`."""
@@ -100,56 +133,10 @@ class AsyncTransport:
 
     async def stream(self, step: Step) -> AsyncIterator[None]:
         """Do as `Transport.stream`."""
-        call, receiver = step
-        attempts = _Attempts(call, receiver, self._max_retries)
+        attempts = Attempts(*step, self.max_retries)
         while True:
-            try:
-                body = call.stream_body()
-                async with self._http.stream(**_request(call, receiver), content=body) as response:
-                    if response.is_success:
-                        receiver.begin(response.status_code, response.headers)
-                        async for item in httpx2.EventSource(response) if call.events else response.aiter_bytes():
-                            receiver.write(item)
-                            yield
-                        failure = receiver.finish()
-                    else:
-                        await response.aread()
-                        failure = failed_response(response)
-            except _FAULTS as fault:
-                failure = failed_connection(fault, self._http.base_url)
-            if failure is None:
+            async for _ in self.attempt(*step, attempts):
+                yield
+            if attempts.failure is None:
                 return
-            await asyncio.sleep(attempts.delay_after(failure))
-
-
-class _Attempts:
-    """Count the attempts of one request, anew whenever one of them got on."""
-
-    def __init__(self, call: Call, receiver: Receiver, max_retries: int) -> None:
-        self._receiver = receiver
-        self._max_retries = 0 if call.once else max_retries
-        self._attempt, self._furthest = 0, receiver.furthest
-
-    def delay_after(self, failure: Failure) -> float:
-        """Return the seconds to wait before the next attempt, or raise what the last one met."""
-        if self._receiver.furthest > self._furthest:
-            self._attempt, self._furthest = 0, self._receiver.furthest
-        delay = next_delay(failure, attempt=self._attempt, max_retries=self._max_retries)
-        if delay is None:
-            raise failure.error from failure.cause
-        self._attempt += 1
-        return delay
-
-
-def _options(url: str, api_key: str | None, timeout: float | None) -> dict[str, Any]:
-    return {
-        "base_url": url,
-        "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
-        "timeout": httpx2.Timeout(timeout, connect=CONNECT_TIMEOUT_SECONDS),
-    }
-
-
-def _request(call: Call, receiver: Receiver) -> dict[str, Any]:
-    timeout = {} if call.timeout is None else {"timeout": call.timeout}
-    headers = {**call.all_headers(), **receiver.headers()}
-    return {"method": call.method, "url": call.path, "params": call.params, "headers": headers, **timeout}
+            await asyncio.sleep(attempts.delay())

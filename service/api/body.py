@@ -14,7 +14,7 @@ from starlette.requests import Request
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.service.admission import Limits
 
-__all__ = ["Upload", "declared_size", "receive_upload"]
+__all__ = ["SpoolFile", "Upload", "declared_size", "receive_upload"]
 
 FILE_FIELD = "file"
 MAX_FIELDS = 20
@@ -43,7 +43,7 @@ async def receive_upload(request: Request, target: Path, *, limits: Limits) -> U
     """
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     with await asyncio.to_thread(target.open, "wb") as file:
-        spool = _SpoolFile(file)
+        spool = SpoolFile(file)
         if kind == b"multipart/form-data":
             upload = await _receive_form(request, parameters.get(b"boundary", b""), spool, limits)
         else:
@@ -52,7 +52,7 @@ async def receive_upload(request: Request, target: Path, *, limits: Limits) -> U
     return upload
 
 
-async def _receive_raw(request: Request, spool: _SpoolFile, limits: Limits) -> Upload:
+async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Upload:
     received = 0
     async for chunk in request.stream():
         limits.check_bytes(received := received + len(chunk))
@@ -62,7 +62,7 @@ async def _receive_raw(request: Request, spool: _SpoolFile, limits: Limits) -> U
     return Upload(name=_text(options[b"filename"]) if b"filename" in options else None)
 
 
-async def _receive_form(request: Request, boundary: bytes, spool: _SpoolFile, limits: Limits) -> Upload:
+async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, limits: Limits) -> Upload:
     form = _Form(spool.buffer)
     received = 0
     try:
@@ -80,7 +80,7 @@ async def _receive_form(request: Request, boundary: bytes, spool: _SpoolFile, li
     return form.upload
 
 
-class _SpoolFile:
+class SpoolFile:
     """Gather small pieces and write them in large ones, off the event loop."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -88,6 +88,7 @@ class _SpoolFile:
         self.buffer = bytearray()
 
     async def flush(self, *, above: int = 0) -> None:
+        """Write what was gathered, if it is more than `above` bytes."""
         if len(self.buffer) > above:
             await asyncio.to_thread(self._file.write, self.buffer)
             self.buffer.clear()

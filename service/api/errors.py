@@ -1,4 +1,4 @@
-"""Every error as application/problem+json (RFC 9457); the one table from code to HTTP status."""
+"""Every error as application/problem+json (RFC 9457); the tables from code to HTTP and to gRPC status."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from straightpcf.points.errors import InternalError, InvalidRequest, MethodNotAl
 from straightpcf.service.api.request_id import HEADER, request_id
 from straightpcf.service.api.schemas import Problem
 
-__all__ = ["PROBLEM_MEDIA_TYPE", "RETRY_AFTER_SECONDS", "STATUS_BY_CODE", "install_error_handlers"]
+__all__ = [
+    "GRPC_STATUS_BY_CODE",
+    "PROBLEM_MEDIA_TYPE",
+    "RETRY_AFTER_SECONDS",
+    "STATUS_BY_CODE",
+    "install_error_handlers",
+]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_SECONDS = 2
@@ -51,6 +57,37 @@ STATUS_BY_CODE: Mapping[str, int] = {
     "connection_failed": 502,
 }
 
+# The names of grpc.StatusCode: REST needs no grpcio.
+GRPC_STATUS_BY_CODE: Mapping[str, str] = {
+    "error": "INTERNAL",
+    "invalid_request": "INVALID_ARGUMENT",
+    "invalid_options": "INVALID_ARGUMENT",
+    "unknown_format": "INVALID_ARGUMENT",
+    "missing_dependency": "UNIMPLEMENTED",
+    "invalid_cloud": "INVALID_ARGUMENT",
+    "malformed_file": "INVALID_ARGUMENT",
+    "too_few_points": "INVALID_ARGUMENT",
+    "unsupported_cloud": "INVALID_ARGUMENT",
+    "too_large": "INVALID_ARGUMENT",  # RESOURCE_EXHAUSTED would say that a later try may do
+    "too_many_points": "INVALID_ARGUMENT",
+    "too_many_bytes": "INVALID_ARGUMENT",
+    "unauthorized": "UNAUTHENTICATED",
+    "not_found": "NOT_FOUND",
+    "method_not_allowed": "UNIMPLEMENTED",
+    "job_not_finished": "FAILED_PRECONDITION",
+    "job_canceled": "ABORTED",
+    "id_conflict": "ALREADY_EXISTS",
+    "job_expired": "NOT_FOUND",
+    "range_not_satisfiable": "OUT_OF_RANGE",
+    "idempotency_conflict": "ALREADY_EXISTS",
+    "rate_limited": "RESOURCE_EXHAUSTED",
+    "quota_exceeded": "RESOURCE_EXHAUSTED",
+    "device_unavailable": "UNAVAILABLE",
+    "server_busy": "UNAVAILABLE",
+    "spool_full": "RESOURCE_EXHAUSTED",
+    "internal_error": "INTERNAL",
+    "connection_failed": "UNAVAILABLE",
+}
 
 _KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
 

@@ -14,7 +14,7 @@ from straightpcf.service.api.body import declared_size, receive_upload
 from straightpcf.service.engine import Engine, JobRequest
 from straightpcf.service.jobs.record import JobRecord
 
-__all__ = ["flag", "take_job"]
+__all__ = ["checked_key", "file_name", "flag", "take_job"]
 
 OPTION_FIELDS = frozenset({"iterations", "seed", "strength"})
 KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
@@ -28,7 +28,7 @@ async def take_job(
     """Receive the body and commit the job; return it, whether it is new, and every field that came with it."""
     engine: Engine = request.app.state.engine
     await engine.check_room(size=declared_size(request))
-    key = _idempotency_key(request)
+    key = checked_key(request.headers.get("idempotency-key"))
     _parse_fields(request.query_params, more_fields)  # before the body, so that it need not be read
     with engine.upload() as source:
         upload = await receive_upload(request, source, limits=engine.limits)
@@ -36,7 +36,7 @@ async def take_job(
         options, format = _parse_fields(fields, more_fields)
         wanted = JobRequest(
             options=options,
-            name=_file_name(fields.get("filename") or request.path_params.get("filename") or upload.name),
+            name=file_name(fields.get("filename") or request.path_params.get("filename") or upload.name),
             format=format,
             owner=owner,
             id=id,
@@ -67,14 +67,14 @@ def _parse_fields(fields: Mapping[str, str], more: frozenset[str]) -> tuple[Deno
     return options, format or None
 
 
-def _idempotency_key(request: Request) -> str | None:
-    key = request.headers.get("idempotency-key")
+def checked_key(key: str | None) -> str | None:
+    """Return an idempotency key; raises InvalidRequest where it is none."""
     if key is not None and (not 0 < len(key) <= MAX_KEY_LENGTH or not key.isprintable()):
         raise InvalidRequest(f"Idempotency-Key must be 1 to {MAX_KEY_LENGTH} printable characters, it has {len(key)}")
     return key
 
 
-def _file_name(name: str | None) -> str | None:
+def file_name(name: str | None) -> str | None:
     """Keep the last part of what the client calls the file; it names a format and a download, never a path here."""
     if name is None:
         return None

@@ -21,13 +21,11 @@ from straightpcf.service.api.openapi import (
     STREAM_RESPONSES,
     problems,
 )
-from straightpcf.service.api.schemas import Job, JobPage, Report
+from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Job, JobPage, Report
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord, JobState
 
 __all__ = ["job_response", "router"]
-
-MAX_WAIT_SECONDS = 60
 
 router = APIRouter(tags=["jobs"])
 Owner = Annotated[str, Depends(owner_of)]

@@ -9,7 +9,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["RequestIdMiddleware", "request_id"]
+__all__ = ["HEADER", "RequestIdMiddleware", "request_id", "usable_id"]
 
 HEADER = "X-Request-Id"
 _USABLE = re.compile(r"[A-Za-z0-9._:-]{1,128}")
@@ -18,6 +18,11 @@ _USABLE = re.compile(r"[A-Za-z0-9._:-]{1,128}")
 def request_id(request: Request) -> str:
     """Return the id of a request that came through the middleware."""
     return str(request.scope.get("request_id") or "")
+
+
+def usable_id(theirs: str | None) -> str:
+    """Return the caller's id of a request, or a fresh one where there is none that a log could hold."""
+    return theirs if theirs and _USABLE.fullmatch(theirs) else uuid.uuid4().hex
 
 
 class RequestIdMiddleware:
@@ -31,8 +36,7 @@ class RequestIdMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        theirs = Headers(scope=scope).get(HEADER, "")
-        scope["request_id"] = theirs if _USABLE.fullmatch(theirs) else uuid.uuid4().hex
+        scope["request_id"] = usable_id(Headers(scope=scope).get(HEADER))
 
         async def send_with_id(message: Message) -> None:
             if message["type"] == "http.response.start":

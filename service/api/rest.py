@@ -10,9 +10,6 @@ from fastapi.responses import JSONResponse, Response
 from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect
 
-import straightpcf
-from straightpcf.points.formats import FORMATS
-from straightpcf.points.options import MAX_ITERATIONS
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import report_and_file, result_response
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
@@ -26,7 +23,7 @@ from straightpcf.service.api.openapi import (
     PATH_PARAMETER,
 )
 from straightpcf.service.api.prefer import parse_prefer
-from straightpcf.service.api.schemas import FormatInfo, Health, Info
+from straightpcf.service.api.schemas import Health, Info
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord
 
@@ -112,25 +109,7 @@ async def ready(request: Request) -> JSONResponse:
 @router.get("/v1/info", summary="Version, limits, formats, devices")
 async def info(request: Request, owner: Owner) -> Info:
     """Say what this server is and takes."""
-    engine: Engine = request.app.state.engine
-    limits = engine.limits
-    return Info(
-        version=straightpcf.__version__,
-        model="StraightPCF",
-        weights=request.app.state.weights,
-        devices=list(engine.backend.devices),
-        max_bytes=limits.max_bytes,
-        max_points=limits.max_points,
-        max_jobs=limits.max_jobs,
-        max_queued_points=limits.max_queued_points,
-        max_iterations=MAX_ITERATIONS,
-        max_sync_seconds=limits.max_sync_seconds,
-        result_ttl_seconds=limits.result_ttl_seconds,
-        formats=[
-            FormatInfo(name=format.name, suffixes=list(format.suffixes), media_type=format.media_type)
-            for format in FORMATS
-        ],
-    )
+    return Info.of(request.app.state.engine, weights=request.app.state.weights)
 
 
 async def _wait_while_connected(engine: Engine, request: Request, record: JobRecord, seconds: float) -> JobRecord:

@@ -7,18 +7,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, PlainSerializer
 
+import straightpcf
+from straightpcf.points.formats import FORMATS
+from straightpcf.points.options import MAX_ITERATIONS
+from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord, JobState
 
-__all__ = ["FormatInfo", "Health", "Info", "Job", "JobPage", "Problem", "Report"]
+__all__ = ["MAX_WAIT_SECONDS", "FormatInfo", "Health", "Info", "Job", "JobPage", "Problem", "Report", "rfc3339"]
+
+MAX_WAIT_SECONDS = 60  # for one request about a job
 
 _ID = "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"
 
 
-def _rfc3339(at: datetime) -> str:
+def rfc3339(at: datetime) -> str:
+    """Write a time of the store as the API does: UTC, milliseconds."""
     return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-Time = Annotated[datetime, PlainSerializer(_rfc3339, return_type=str)]
+Time = Annotated[datetime, PlainSerializer(rfc3339, return_type=str)]
 
 
 class Problem(BaseModel):
@@ -232,3 +239,20 @@ class Info(BaseModel):
     max_sync_seconds: float
     result_ttl_seconds: float
     formats: list[FormatInfo]
+
+    @classmethod
+    def of(cls, engine: Engine, *, weights: str) -> Info:
+        """Describe a server."""
+        names = ("max_bytes", "max_points", "max_jobs", "max_queued_points", "max_sync_seconds", "result_ttl_seconds")
+        return cls(
+            version=straightpcf.__version__,
+            model="StraightPCF",
+            weights=weights,
+            devices=list(engine.backend.devices),
+            max_iterations=MAX_ITERATIONS,
+            **{name: getattr(engine.limits, name) for name in names},
+            formats=[
+                FormatInfo(name=format.name, suffixes=list(format.suffixes), media_type=format.media_type)
+                for format in FORMATS
+            ],
+        )

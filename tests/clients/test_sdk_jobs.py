@@ -32,9 +32,14 @@ SMALL = noisy(torus(400), 0.01)
 LARGE = noisy(sphere(60_000), 0.01)  # takes the worker many seconds
 
 
+@pytest.fixture(params=["http", "grpc"])
+def url(request: pytest.FixtureRequest, server: RunningServer) -> str:
+    return server.url if request.param == "http" else server.grpc_url
+
+
 @pytest.fixture
-def client(server: RunningServer) -> Iterator[Client]:
-    with Client(server.url) as client:
+def client(url: str) -> Iterator[Client]:
+    with Client(url) as client:
         yield client
 
 
@@ -124,9 +129,9 @@ def test_a_failed_job_raises_the_class_of_its_code(client: Client) -> None:
     job.delete()
 
 
-def test_the_async_client_does_the_same_and_a_cancelled_coroutine_ends_its_job(server: RunningServer) -> None:
+def test_the_async_client_does_the_same_and_a_cancelled_coroutine_ends_its_job(url: str) -> None:
     async def use() -> None:
-        async with AsyncClient(server.url) as client:
+        async with AsyncClient(url) as client:
             job = await client.jobs.create(SMALL, iterations=1)
             frames = [frame async for frame in job.patches()]
             assert sum(len(frame.indices) for frame in frames) >= 400
@@ -148,12 +153,13 @@ def test_the_async_client_does_the_same_and_a_cancelled_coroutine_ends_its_job(s
 
 
 @contextmanager
-def cutting_proxy(server: RunningServer, *, limits: Iterator[int], damage: int = -1) -> Iterator[tuple[str, list[str]]]:
+def cutting_proxy(to: str, *, limits: Iterator[int], damage: int = -1) -> Iterator[tuple[str, list[str]]]:
     """Pass connections on and cut each answer after so many bytes; a byte at `damage` is changed in the first one.
 
     Collects the Range headers that were sent.
     """
-    host, port = server.url.removeprefix("http://").split(":")
+    scheme, _, address = to.partition("://")
+    host, port = address.split(":")
     ranges: list[str] = []
 
     def pass_on(client: socket.socket, limit: int, damage: int) -> None:
@@ -196,21 +202,22 @@ def cutting_proxy(server: RunningServer, *, limits: Iterator[int], damage: int =
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
         threading.Thread(target=listen, args=(listener,), daemon=True).start()
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}", ranges
+        yield f"{scheme}://127.0.0.1:{listener.getsockname()[1]}", ranges
 
 
 @pytest.fixture
-def done(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def done(server: RunningServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
-    job = client.jobs.create(noisy(torus(2500), 0.01), iterations=1)
-    job.wait()
-    yield job
-    job.delete()
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(2500), 0.01), iterations=1)
+        job.wait()
+        yield job
+        job.delete()
 
 
 def test_a_download_that_breaks_goes_on_where_it_was(server: RunningServer, done: Any, tmp_path: Path) -> None:
     whole = done.result().content
-    with cutting_proxy(server, limits=repeat(9000)) as (url, ranges), Client(url, max_retries=2) as client:
+    with cutting_proxy(server.url, limits=repeat(9000)) as (url, ranges), Client(url, max_retries=2) as client:
         job = client.jobs.get(done.id)
         job.result(tmp_path / "clean.npy")
     assert (tmp_path / "clean.npy").read_bytes() == whole
@@ -219,10 +226,12 @@ def test_a_download_that_breaks_goes_on_where_it_was(server: RunningServer, done
     assert starts == sorted(set(starts))
 
 
-def test_events_and_patches_go_on_over_cut_connections(server: RunningServer, done: Any) -> None:
+@pytest.mark.parametrize("transport", ["http", "grpc"])
+def test_events_and_patches_go_on_over_cut_connections(server: RunningServer, done: Any, transport: str) -> None:
     frames, events = list(done.patches()), list(done.events())
-    growing = (2000 * n for n in range(1, 1000))
-    with cutting_proxy(server, limits=growing) as (url, _), Client(url, max_retries=9) as client:
+    to, step = (server.url, 2000) if transport == "http" else (server.grpc_url, 20_000)
+    growing = (step * n for n in range(1, 1000))
+    with cutting_proxy(to, limits=growing) as (url, _), Client(url, max_retries=9) as client:
         job = client.jobs.get(done.id)
         assert list(job.events()) == events
         again = list(job.patches())
@@ -231,7 +240,7 @@ def test_events_and_patches_go_on_over_cut_connections(server: RunningServer, do
 
 def test_a_file_that_arrives_damaged_is_fetched_again(server: RunningServer, done: Any) -> None:
     whole = done.result().content
-    with cutting_proxy(server, limits=repeat(10**9), damage=20_000) as (url, _), Client(url) as client:
+    with cutting_proxy(server.url, limits=repeat(10**9), damage=20_000) as (url, _), Client(url) as client:
         assert client.jobs.get(done.id).result().content == whole
 
 
@@ -240,7 +249,7 @@ def test_a_call_that_never_gets_on_is_given_up_and_leaves_no_file(
 ) -> None:
     monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
     with (
-        cutting_proxy(server, limits=repeat(50)) as (url, _),
+        cutting_proxy(server.url, limits=repeat(50)) as (url, _),
         Client(url, max_retries=2) as client,
         pytest.raises(ConnectionFailed),
     ):

@@ -1,0 +1,136 @@
+"""Carry requests over gRPC (points/wire/straightpcf.proto); needs the extra `grpc`."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+from straightpcf.clients.sdk.receive import Receiver
+from straightpcf.clients.sdk.request import Call
+from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport
+from straightpcf.points.errors import InvalidRequest, MissingDependency
+
+try:
+    import grpc
+    from grpc_health.v1.health_pb2_grpc import HealthStub
+
+    from straightpcf.clients.sdk.grpc_messages import (
+        UPLOAD,
+        Answer,
+        failed_rpc,
+        metadata_of,
+        request_of,
+        upload_messages,
+    )
+    from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub
+except ImportError as exc:
+    raise MissingDependency(f"grpc:// needs an extra: pip install 'straightpcf[grpc]' ({exc})") from exc
+
+__all__ = ["AsyncGrpcTransport", "GrpcTransport"]
+
+# A dead peer is noticed by pings, so that a stream may be silent for as long as it likes.
+_OPTIONS = (("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000))
+
+
+class GrpcTransport(Transport):
+    """Talk to the gRPC service."""
+
+    def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.max_retries = max_retries
+        self._url, self._key, self._timeout = url, api_key, timeout
+        target, credentials = _target(url)
+        if credentials is None:
+            self._channel = grpc.insecure_channel(target, options=_OPTIONS)
+        else:
+            self._channel = grpc.secure_channel(target, credentials, options=_OPTIONS)
+        self._stub = _stub(self._channel)
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._channel.close()
+
+    def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
+        """Make one call."""
+        send = upload_messages(call) if call.rpc == UPLOAD else request_of(call, receiver)
+        try:
+            answer = Answer(call, receiver)
+            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self._timeout))
+            for message in came if hasattr(came, "__next__") else (came,):
+                answer.take(message)
+                yield
+            attempts.failure = answer.finish()
+        except grpc.RpcError as error:
+            attempts.failure = failed_rpc(error, self._url)
+
+
+class AsyncGrpcTransport(AsyncTransport):
+    """Talk to the gRPC service from a coroutine."""
+
+    def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.max_retries = max_retries
+        self._url, self._key, self._timeout = url, api_key, timeout
+        self._channel: Any = None  # it belongs to the loop that makes the first call
+        self._stub: Any = None
+        _target(url)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        if self._channel is not None:
+            await self._channel.close()
+
+    async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
+        """Make one call."""
+        self._open()
+        send = _asynchronous(upload_messages(call)) if call.rpc == UPLOAD else request_of(call, receiver)
+        try:
+            answer = Answer(call, receiver)
+            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self._timeout))
+            if hasattr(came, "__aiter__"):
+                async for message in came:
+                    answer.take(message)
+                    yield
+            else:
+                answer.take(await came)
+                yield
+            attempts.failure = answer.finish()
+        except grpc.RpcError as error:
+            attempts.failure = failed_rpc(error, self._url)
+
+    def _open(self) -> None:
+        if self._channel is None:
+            target, credentials = _target(self._url)
+            if credentials is None:
+                self._channel = grpc.aio.insecure_channel(target, options=_OPTIONS)
+            else:
+                self._channel = grpc.aio.secure_channel(target, credentials, options=_OPTIONS)
+            self._stub = _stub(self._channel)
+
+
+def _stub(channel: Any) -> Any:
+    stub: Any = DenoiseServiceStub(channel)  # type: ignore[no-untyped-call]
+    stub.GetHealth = HealthStub(channel).Check  # the standard service, grpc.health.v1
+    return stub
+
+
+def _target(url: str) -> tuple[str, Any]:
+    parts = urlsplit(url)
+    if not parts.hostname or parts.path.strip("/"):
+        raise InvalidRequest(
+            f"{url!r} is no address of a gRPC server; it must be grpc://HOST:PORT or grpcs://HOST:PORT"
+        )
+    return parts.netloc, grpc.ssl_channel_credentials() if parts.scheme == "grpcs" else None
+
+
+def _how(call: Call, api_key: str | None, timeout: float | None) -> dict[str, Any]:
+    """Return the metadata and, for a call with one short answer, the deadline."""
+    silence = timeout if call.timeout is None else call.timeout
+    short = call.rpc in ("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth")
+    return {"metadata": metadata_of(call, api_key), "timeout": silence if short else None}
+
+
+async def _asynchronous(messages: Iterator[Any]) -> AsyncIterator[Any]:
+    import asyncio
+
+    while (message := await asyncio.to_thread(next, messages, None)) is not None:
+        yield message

@@ -1,0 +1,293 @@
+"""The gRPC face of the engine: parse a call, hand it over, serialise what comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import grpc
+from google.protobuf.empty_pb2 import Empty
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, RangeNotSatisfiable
+from straightpcf.points.formats import format_named
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire import straightpcf_pb2 as pb
+from straightpcf.points.wire import straightpcf_pb2_grpc as stubs
+from straightpcf.points.wire.messages import MAX_MESSAGE_BYTES, event_message, message_of, patch_messages, plain_of
+from straightpcf.points.wire.patches import PatchReader
+from straightpcf.service.api.auth import Gate
+from straightpcf.service.api.body import SpoolFile
+from straightpcf.service.api.grpc_call import Caller, Context, answering
+from straightpcf.service.api.intake import file_name
+from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Info, Job, rfc3339
+from straightpcf.service.engine import Engine, JobRequest
+from straightpcf.service.jobs.record import JobEvent, JobRecord
+from straightpcf.service.telemetry import Telemetry
+
+__all__ = ["GrpcServer"]
+
+SERVICE = pb.DESCRIPTOR.services_by_name["DenoiseService"].full_name
+CHUNK_BYTES = 2**18
+WRITE_BYTES = 2**20
+HEALTH_SECONDS = 0.25
+_OPTIONS = (
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
+    ("grpc.so_reuseport", 0),  # two servers on one port would share its calls
+)
+
+_Part = TypeVar("_Part", pb.DenoiseRequest, pb.CreateJobRequest)
+
+logger = logging.getLogger("uvicorn.error")
+
+
+class GrpcServer:
+    """Listen on a port of its own, with health checking (grpc.health.v1) and reflection; lives on the event loop."""
+
+    def __init__(self, engine: Engine, *, gate: Gate, telemetry: Telemetry, weights: str, host: str, port: int) -> None:
+        self._engine = engine
+        self._service = DenoiseService(engine, gate=gate, telemetry=telemetry, weights=weights)
+        self._host, self._wanted = f"[{host}]" if ":" in host else host, port
+        self._health = health.aio.HealthServicer()
+        self._watch: asyncio.Task[None] | None = None
+        self._server: Any = None  # it belongs to the loop that starts it
+
+    async def start(self) -> None:
+        """Begin to listen; raises InvalidOptions if the port is taken."""
+        server = grpc.aio.server(options=_OPTIONS)
+        stubs.add_DenoiseServiceServicer_to_server(self._service, server)  # type: ignore[no-untyped-call]
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
+        reflection.enable_server_reflection((SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
+        try:
+            port = server.add_insecure_port(f"{self._host}:{self._wanted}")
+        except RuntimeError as exc:
+            raise InvalidOptions(f"grpc_port is {self._wanted}; {self._host}:{self._wanted} cannot be had") from exc
+        await server.start()
+        self._server = server
+        self._watch = asyncio.create_task(self._keep_health())
+        logger.info("gRPC on %s:%d", self._host, port)
+
+    async def stop(self, *, patience_seconds: float) -> None:
+        """Take no more calls, and cancel those that are not over in a while."""
+        if self._server is None or self._watch is None:
+            return
+        self._watch.cancel()
+        await self._health.enter_graceful_shutdown()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(patience_seconds):
+                await self._service.wait_idle()
+        # Its own grace period waits for calls whose connection broke in the middle of a message, too.
+        await self._server.stop(0)
+
+    async def _keep_health(self) -> None:
+        states = health_pb2.HealthCheckResponse
+        while True:
+            status = states.SERVING if self._engine.ready else states.NOT_SERVING
+            for name in ("", SERVICE):
+                await self._health.set(name, status)
+            await asyncio.sleep(HEALTH_SECONDS)
+
+
+class DenoiseService(stubs.DenoiseServiceServicer):
+    """Answer the calls of straightpcf.v1.DenoiseService (points/wire/straightpcf.proto)."""
+
+    def __init__(self, engine: Engine, *, gate: Gate, telemetry: Telemetry, weights: str) -> None:
+        self._engine, self._gate, self._telemetry, self._weights = engine, gate, telemetry, weights
+        self._active = 0
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    async def wait_idle(self) -> None:
+        """Return as soon as no call is being answered."""
+        await self._idle.wait()
+
+    @contextlib.asynccontextmanager
+    async def _answering(self, context: Context, method: str) -> AsyncIterator[Caller]:
+        self._active += 1
+        self._idle.clear()
+        try:
+            async with answering(context, method, gate=self._gate, telemetry=self._telemetry) as caller:
+                yield caller
+        finally:
+            self._active -= 1
+            if self._active == 0:
+                self._idle.set()
+
+    # Responses are written, not yielded: a cancelled call then ends inside of these methods, and so does its job.
+
+    async def Denoise(self, requests: AsyncIterator[pb.DenoiseRequest], context: Context) -> None:  # noqa: N802
+        """Work on one file while its caller listens."""
+        async with self._answering(context, "Denoise") as caller:
+            config = (await _first(requests)).config
+            record, _ = await self._take(config.job, requests, caller, endpoint="denoise")
+            try:
+                await context.write(pb.DenoiseResponse(accepted=_job(record)))
+                if config.patches:
+                    async for patch in self._patches(record):
+                        await context.write(pb.DenoiseResponse(patch=patch))
+                else:
+                    async for progress in self._progress(record):
+                        await context.write(pb.DenoiseResponse(progress=progress))
+                path, record = await self._engine.result(record.id, owner=record.owner)
+                if config.return_file:
+                    async for chunk in _chunks(path):
+                        await context.write(pb.DenoiseResponse(chunk=chunk))
+                await context.write(pb.DenoiseResponse(summary=_job(record)))
+            finally:
+                if caller.idempotency_key is None:  # nobody else knows this job
+                    await asyncio.shield(self._engine.delete(record.id, owner=record.owner))
+
+    async def CreateJob(  # noqa: N802
+        self, requests: AsyncIterator[pb.CreateJobRequest], context: Context
+    ) -> pb.Job:
+        """Commit a job."""
+        async with self._answering(context, "CreateJob") as caller:
+            config = (await _first(requests)).config
+            record, _ = await self._take(config, requests, caller, endpoint="jobs")
+            return _job(record)
+
+    async def GetJob(self, request: pb.GetJobRequest, context: Context) -> pb.Job:  # noqa: N802
+        """Show a job, now or at its end."""
+        async with self._answering(context, "GetJob") as caller:
+            if not 0 <= request.wait_seconds <= MAX_WAIT_SECONDS:
+                raise InvalidRequest(f"wait_seconds is {request.wait_seconds}; it must be in 0..{MAX_WAIT_SECONDS}")
+            return _job(await self._engine.wait(request.id, owner=caller.owner, seconds=request.wait_seconds))
+
+    async def ListJobs(  # noqa: N802
+        self, request: pb.ListJobsRequest, context: Context
+    ) -> pb.ListJobsResponse:
+        """Show a page of jobs."""
+        async with self._answering(context, "ListJobs") as caller:
+            if request.limit > 200:
+                raise InvalidRequest(f"limit is {request.limit}; it must be in 1..200")
+            records, cursor = await self._engine.list(
+                owner=caller.owner,
+                states=[_state(state) for state in request.states],
+                limit=request.limit or 50,
+                cursor=request.cursor or None,
+            )
+            return pb.ListJobsResponse(jobs=[_job(record) for record in records], next_cursor=cursor or "")
+
+    async def WatchJob(self, request: pb.WatchJobRequest, context: Context) -> None:  # noqa: N802
+        """Send events until the job is finished."""
+        async with self._answering(context, "WatchJob") as caller:
+            async for event in self._engine.events(request.id, owner=caller.owner, after=request.after):
+                record = None
+                if event.kind == "completed":
+                    record = await self._engine.get(request.id, owner=caller.owner)
+                await context.write(_event(event, record))
+
+    async def CancelJob(self, request: pb.CancelJobRequest, context: Context) -> pb.Job:  # noqa: N802
+        """End a job."""
+        async with self._answering(context, "CancelJob") as caller:
+            return _job(await self._engine.cancel(request.id, owner=caller.owner))
+
+    async def DeleteJob(self, request: pb.DeleteJobRequest, context: Context) -> Empty:  # noqa: N802
+        """Forget a job."""
+        async with self._answering(context, "DeleteJob") as caller:
+            await self._engine.delete(request.id, owner=caller.owner)
+            return Empty()
+
+    async def StreamPatches(self, request: pb.StreamPatchesRequest, context: Context) -> None:  # noqa: N802
+        """Send patches as they are finished."""
+        async with self._answering(context, "StreamPatches") as caller:
+            async for patch in self._patches(await self._engine.get(request.id, owner=caller.owner)):
+                await context.write(patch)
+
+    async def DownloadResult(self, request: pb.DownloadResultRequest, context: Context) -> None:  # noqa: N802
+        """Send a result from an offset on."""
+        async with self._answering(context, "DownloadResult") as caller:
+            path, record = await self._engine.result(request.id, owner=caller.owner)
+            result = Job.of(record).plain()["result"]
+            if request.offset > result["bytes"]:
+                raise RangeNotSatisfiable(f"offset {request.offset} is outside the {result['bytes']} bytes")
+            await context.write(pb.DownloadResultResponse(result=message_of(pb.ResultInfo, result)))
+            async for chunk in _chunks(path, request.offset):
+                await context.write(pb.DownloadResultResponse(chunk=chunk))
+
+    async def GetServerInfo(self, request: Empty, context: Context) -> pb.ServerInfo:  # noqa: N802
+        """Say what this server is and takes."""
+        async with self._answering(context, "GetServerInfo"):
+            return message_of(pb.ServerInfo, Info.of(self._engine, weights=self._weights).model_dump())
+
+    # --- stages
+
+    async def _take(
+        self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, *, endpoint: str
+    ) -> tuple[JobRecord, bool]:
+        """Spool the file and commit the job."""
+        engine = self._engine
+        options = DenoiseOptions(**plain_of(config.options))
+        if config.format:
+            format_named(config.format)
+        await engine.check_room()
+        received = 0
+        with engine.upload() as source:
+            with await asyncio.to_thread(source.open, "wb") as file:
+                spool = SpoolFile(file)
+                async for message in requests:
+                    if message.WhichOneof("part") != "chunk":
+                        raise InvalidRequest("a config comes once, before the first chunk")
+                    engine.limits.check_bytes(received := received + len(message.chunk))
+                    spool.buffer += message.chunk
+                    await spool.flush(above=WRITE_BYTES)
+                await spool.flush()
+            wanted = JobRequest(
+                options=options,
+                name=file_name(config.filename or None),
+                format=config.format or None,
+                owner=caller.owner,
+                id=config.id or None,
+                idempotency_key=caller.idempotency_key,
+                endpoint=endpoint,
+                traceparent=caller.traceparent,
+            )
+            return await engine.submit(source, wanted)
+
+    async def _progress(self, record: JobRecord) -> AsyncIterator[pb.Progress]:
+        async for event in self._engine.events(record.id, owner=record.owner):
+            if event.kind == "progress":
+                yield message_of(pb.Progress, event.data)
+
+    async def _patches(self, record: JobRecord) -> AsyncIterator[pb.Patch]:
+        reader = PatchReader()
+        async for chunk in self._engine.patches(record.id, owner=record.owner):
+            for frame in reader.feed(chunk):
+                for patch in patch_messages(frame, points=reader.points or 0):
+                    yield patch
+
+
+async def _first(requests: AsyncIterator[_Part]) -> _Part:
+    message = await anext(requests, None)
+    if message is None or message.WhichOneof("part") != "config":
+        raise InvalidRequest("the first message of a call must be its config")
+    return message
+
+
+async def _chunks(path: Path, offset: int = 0) -> AsyncIterator[bytes]:
+    with await asyncio.to_thread(path.open, "rb") as file:
+        file.seek(offset)
+        while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+            yield chunk
+
+
+def _job(record: JobRecord) -> pb.Job:
+    return message_of(pb.Job, Job.of(record).plain())
+
+
+def _event(event: JobEvent, record: JobRecord | None) -> pb.JobEvent:
+    data = event.data if record is None else Job.of(record).plain()
+    return event_message(event.kind, event.seq, rfc3339(event.at), data)
+
+
+def _state(number: int) -> Any:
+    try:
+        return pb.JobState.Name(number).removeprefix("JOB_STATE_").lower()
+    except ValueError:
+        raise InvalidRequest(f"state {number} is unknown; the states are 1..7") from None

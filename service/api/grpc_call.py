@@ -1,0 +1,83 @@
+"""What every call of the gRPC face shares: who asks, its request id, and errors as rich statuses (google.rpc)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, Never, TypeAlias
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.duration_pb2 import Duration
+from google.rpc import code_pb2, error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
+from straightpcf.points.errors import InternalError, StraightPCFError
+from straightpcf.service.api.auth import Gate
+from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS
+from straightpcf.service.api.intake import checked_key
+from straightpcf.service.api.request_id import usable_id
+from straightpcf.service.telemetry import Telemetry
+
+__all__ = ["Caller", "Context", "answering"]
+
+DOMAIN = "straightpcf"
+
+Context: TypeAlias = grpc.aio.ServicerContext[Any, Any]
+
+logger = logging.getLogger("uvicorn.error")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Caller:
+    """Hold what a call's metadata says."""
+
+    owner: str
+    request_id: str
+    idempotency_key: str | None
+    traceparent: str | None
+
+
+@asynccontextmanager
+async def answering(context: Context, method: str, *, gate: Gate, telemetry: Telemetry) -> AsyncIterator[Caller]:
+    """Let a caller in, and end the call with a status that says what the block raised."""
+    said = {name: value for name, value in context.invocation_metadata() or () if isinstance(value, str)}
+    id = usable_id(said.get("x-request-id"))
+    status = "OK"
+    try:
+        await context.send_initial_metadata((("x-request-id", id),))
+        yield Caller(
+            owner=gate.admit(said.get("authorization")),
+            request_id=id,
+            idempotency_key=checked_key(said.get("idempotency-key")),
+            traceparent=said.get("traceparent"),
+        )
+    except StraightPCFError as error:
+        status = GRPC_STATUS_BY_CODE[error.code]
+        await _abort(context, error, id)
+    except Exception:
+        status = "INTERNAL"
+        logger.exception("request %s: %s failed", id, method)
+        await _abort(context, InternalError("the server met an error of its own"), id)
+    except BaseException:
+        status = "CANCELLED"
+        raise
+    finally:
+        telemetry.grpc_requests.labels(method, status).inc()
+
+
+async def _abort(context: Context, error: StraightPCFError, request_id: str) -> Never:
+    code = GRPC_STATUS_BY_CODE[error.code]
+    metadata = {"retryable": str(error.retryable).lower(), "request_id": request_id}
+    details = [error_details_pb2.ErrorInfo(reason=error.code.upper(), domain=DOMAIN, metadata=metadata)]
+    if error.retryable:
+        details.append(error_details_pb2.RetryInfo(retry_delay=Duration(seconds=RETRY_AFTER_SECONDS)))
+    rich = status_pb2.Status(code=code_pb2.Code.Value(code), message=error.message)
+    for detail in details:
+        (packed := AnyMessage()).Pack(detail)
+        rich.details.append(packed)
+    status = rpc_status.to_status(rich)
+    await context.abort(status.code, status.details, status.trailing_metadata)
+    raise AssertionError("abort always raises")
