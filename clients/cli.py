@@ -164,7 +164,9 @@ def serve(
     port: Annotated[int | None, typer.Option(help="The port; 0 for any free one.  [default: 8000]")] = None,
     grpc_port: Annotated[int | None, typer.Option(help="Serve gRPC too, on this port.  [default: no gRPC]")] = None,
     data_dir: Annotated[Path | None, typer.Option(help="Where jobs are kept.")] = None,
-    device: Annotated[Device | None, typer.Option(help="What to compute on.  [default: auto]")] = None,
+    device: Annotated[
+        str | None, typer.Option(help="auto, cpu, cuda, cuda:N; several with commas.  [default: auto]")
+    ] = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the worker.")] = None,
     max_bytes: Annotated[int | None, typer.Option(help="Largest request body.")] = None,
@@ -184,7 +186,7 @@ def serve(
         port=port,
         grpc_port=grpc_port,
         data_dir=data_dir,
-        device=None if device is None else device.value,
+        device=device,
         weights=weights,
         threads=threads,
         max_bytes=max_bytes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -20,7 +21,7 @@ from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.patches import Patches, cut_patches
-from straightpcf.points.errors import DeviceUnavailable, TooFewPoints
+from straightpcf.points.errors import DeviceUnavailable, TooFewPoints, TooLarge
 from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
@@ -74,15 +75,23 @@ def load_filter(weights: Path | None = None, *, device: str = "auto", threads: i
     threads: CPU threads, all cores by default; the result does not depend on it. Raises DeviceUnavailable for
     a device that is not here, MalformedFile for weights that do not fit.
     """
-    if device not in ("auto", "cpu", "cuda"):
-        raise DeviceUnavailable(f'device is {device!r}; it must be "auto", "cpu" or "cuda"')
-    if device == "cuda" and not torch.cuda.is_available():
-        raise DeviceUnavailable("device cuda was asked for, and torch sees no CUDA device here")
-    chosen = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    chosen = _device(device)
     path = DEFAULT_WEIGHTS if weights is None else weights
     network = load_checkpoint(path, device=chosen)
     calibration = Calibration.from_metadata(read_checkpoint(path)[1])
     return Filter(network, calibration=calibration, device=chosen, threads=threads)
+
+
+def _device(name: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name):
+        raise DeviceUnavailable(f'device is {name[:40]!r}; it must be "auto", "cpu", "cuda" or "cuda:N"')
+    here = torch.cuda.device_count() if name != "cpu" else 0
+    if name == "auto":
+        return "cuda" if here else "cpu"
+    number = int(name.partition(":")[2] or 0)
+    if name != "cpu" and number >= here:
+        raise DeviceUnavailable(f"device {name} was asked for, and torch sees {here} CUDA devices here")
+    return name
 
 
 def denoise(
@@ -105,6 +114,7 @@ class Filter:
         threads: int | None = None,
         coverage: float = COVERAGE,
         euler_steps: int = EULER_STEPS,
+        batch: int | None = None,
     ) -> None:
         self.network = network.eval().requires_grad_(requires_grad=False)
         self.calibration = calibration or Calibration()
@@ -112,7 +122,31 @@ class Filter:
         self.threads = threads or os.cpu_count() or 1
         self.coverage = coverage
         self.euler_steps = euler_steps
+        self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
         keep_large_buffers()
+
+    def move(self, x: torch.Tensor, rows: int) -> npt.NDArray[np.float64]:
+        """Return how far the first `rows` points of each patch move: (B, P, 3) float32 -> (B, rows, 3).
+
+        A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
+        is too many.
+        """
+        moves: list[npt.NDArray[np.float64]] = []
+        done = 0
+        while done < len(x):
+            some, batch = x[done : done + self.batch], self.batch
+            try:
+                moved, _ = self.network(some, euler_steps=self.euler_steps, rows=rows)
+                moves.append((moved - some[:, :rows]).double().cpu().numpy())
+                done += len(some)
+            except torch.OutOfMemoryError as exc:
+                if batch == 1:
+                    raise TooLarge(
+                        f"one patch of {x.shape[1]} points does not fit in the memory of {self.device}"
+                    ) from exc
+                self.batch = batch // 2
+                torch.cuda.empty_cache()
+        return np.concatenate(moves)
 
     def denoise(
         self,
@@ -219,14 +253,13 @@ class Run:
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
     ) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
         """Run the network over all patches; yield each one's displacements of the points it owns, in its own scale."""
-        step = 1 if self.filter.device == "cpu" else _CUDA_BATCH
+        step = self.filter.batch
 
         def move(first: int) -> npt.NDArray[np.float64]:
             chosen = range(first, min(first + step, len(cut.seeds)))
             rows = max(1, int(cut.owned[first : chosen.stop].max()))
             x = self._tensor(here, cut, scales, chosen)
-            moved, _ = self.filter.network(x, euler_steps=self.filter.euler_steps, rows=rows)
-            return (moved - x[:, :rows]).double().cpu().numpy()  # type: ignore[no-any-return]
+            return self.filter.move(x, rows)
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)

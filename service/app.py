@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import socket
+import sqlite3
+import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from types import FrameType
@@ -14,7 +17,7 @@ from fastapi import Depends, FastAPI
 from starlette.middleware.cors import CORSMiddleware
 
 import straightpcf
-from straightpcf.points.errors import MissingDependency
+from straightpcf.points.errors import InvalidOptions, MissingDependency
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
@@ -26,6 +29,7 @@ from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 from straightpcf.service.web import install_page
@@ -86,6 +90,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
 def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
+    _check_start(settings)
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
     config = uvicorn.Config(
@@ -147,6 +152,22 @@ def _weights_name(settings: Settings) -> str:
     return settings.weights.name if settings.weights else "shipped"
 
 
+def _check_start(settings: Settings) -> None:
+    """Raise InvalidOptions for what would otherwise end the server in the middle of its start."""
+    try:
+        settings.data_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=settings.data_dir):
+            pass
+        JobStore(settings.data_dir / "jobs.sqlite3").close()
+    except (OSError, sqlite3.Error) as exc:
+        raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
+    if settings.grpc_port:
+        try:
+            socket.create_server((settings.host, settings.grpc_port)).close()
+        except OSError as exc:
+            raise InvalidOptions(f"grpc_port is {settings.grpc_port}, which cannot be had: {exc}") from exc
+
+
 def _is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
@@ -171,4 +192,9 @@ def _limits(settings: Settings) -> Limits:
 
 
 def _local_backend(settings: Settings) -> LocalBackend:
-    return LocalBackend([WorkerSpec(device=settings.device, weights=settings.weights, threads=settings.threads)])
+    return LocalBackend(
+        [
+            WorkerSpec(device=device.strip(), weights=settings.weights, threads=settings.threads)
+            for device in settings.device.split(",")
+        ]
+    )

@@ -37,7 +37,8 @@ class Settings:
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
-    device: "auto" | "cpu" | "cuda".  weights: None for the shipped ones.  threads: None for torch's own choice.
+    device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
+    weights: None for the shipped ones.  threads: None for torch's own choice.
     shutdown_seconds: how long running requests may finish after SIGTERM.
     """
 

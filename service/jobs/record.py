@@ -76,7 +76,11 @@ class JobEvent:
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """Hold the right to work on a job: `fence` grows with every claim, and an older one can write nothing."""
+    """Hold the right to work on a job: `fence` grows with every claim, and an older one can write nothing.
+
+    deaths: of workers that had the job before.
+    """
 
     record: JobRecord
     fence: int
+    deaths: int

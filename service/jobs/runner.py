@@ -19,7 +19,7 @@ from straightpcf.service.jobs.store import JobStore
 
 __all__ = ["JobRunner"]
 
-MAX_ATTEMPTS = 3
+MAX_DEATHS = 3
 LEASE_SECONDS = 15.0
 HEARTBEAT_SECONDS = 1.0
 POLL_SECONDS = 1.0  # for jobs that another server took in
@@ -160,11 +160,11 @@ class JobRunner:
 
     async def _after_death(self, claim: Claim, death: WorkerDied) -> None:
         record, fence = claim.record, claim.fence
-        logger.warning("%s (attempt %d of %d)", death, record.attempts, MAX_ATTEMPTS)
-        if record.attempts < MAX_ATTEMPTS:
-            await self._call(JobStore.release, record.id, fence, "its worker died; the job starts again")
+        logger.warning("%s (the job's death %d of %d)", death, claim.deaths + 1, MAX_DEATHS)
+        if claim.deaths + 1 < MAX_DEATHS:
+            await self._call(JobStore.release, record.id, fence, "its worker died; the job starts again", died=True)
         else:
-            error = InternalError(f"the worker died {MAX_ATTEMPTS} times on this cloud, which was then given up")
+            error = InternalError(f"the worker died {MAX_DEATHS} times on this cloud, which was then given up")
             await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
 
 

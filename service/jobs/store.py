@@ -22,6 +22,7 @@ from straightpcf.points.errors import (
     IdConflict,
     IdempotencyConflict,
     InternalError,
+    InvalidOptions,
     InvalidRequest,
     NotFound,
     StraightPCFError,
@@ -40,6 +41,7 @@ from straightpcf.service.jobs.record import (
 
 __all__ = ["JobStore", "Load", "NewJob"]
 
+SCHEMA_VERSION = 1
 _BUSY_SECONDS = 30.0
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
@@ -81,11 +83,23 @@ class JobStore:
         self._db.execute("PRAGMA journal_mode = WAL")
         self._db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
         self._db.execute("PRAGMA foreign_keys = ON")
-        self._db.executescript(files(__package__).joinpath("schema.sql").read_text())
+        self._prepare(path)
 
     def close(self) -> None:
         """Close the file."""
         self._db.close()
+
+    def _prepare(self, path: Path) -> None:
+        (version,) = self._db.execute("PRAGMA user_version").fetchone()
+        if version > SCHEMA_VERSION:
+            raise InvalidOptions(
+                f"{path} has schema {version}, written by a newer straightpcf; this one knows {SCHEMA_VERSION}"
+            )
+        self._db.executescript(files(__package__).joinpath("schema.sql").read_text())
+        columns = {row["name"] for row in self._db.execute("PRAGMA table_info(jobs)")}
+        if "deaths" not in columns:  # before versions were counted
+            self._db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
+        self._db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     # --- what clients ask for
 
@@ -189,7 +203,7 @@ class JobStore:
                 " (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
                 (server, now + lease_seconds, now),
             ).fetchone()
-            return None if row is None else Claim(record=self._record(row), fence=row["fence"])
+            return None if row is None else Claim(record=self._record(row), fence=row["fence"], deaths=row["deaths"])
 
     def extend(self, server: str, lease_seconds: float) -> tuple[set[str], set[str]]:
         """Renew the leases of a server; return the ids it still holds, and those of them that should be canceled."""
@@ -247,10 +261,11 @@ class JobStore:
             self._end(id, state, error={"code": error.code, "detail": error.message}, expires_in=expires_in)
             return True
 
-    def release(self, id: str, fence: int, message: str) -> bool:
-        """Put a job back into its place in the queue."""
+    def release(self, id: str, fence: int, message: str, *, died: bool = False) -> bool:
+        """Put a job back into its place in the queue; died: it killed its worker, as far as one can tell."""
         with self._transaction():
-            mine = self._update(id, fence, "state = 'queued', server = NULL, lease_until = NULL, progress = 0")
+            set_ = "state = 'queued', server = NULL, lease_until = NULL, progress = 0, deaths = deaths + ?"
+            mine = self._update(id, fence, set_, int(died))
             if mine:
                 self._requeued(id, message)
             return mine

@@ -1,0 +1,99 @@
+"""The page at / in headless Chromium, as a user has it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.points.formats import read_cloud
+from tests.clouds import noisy, torus
+from tests.conftest import RunningServer
+
+POINTS = 2500
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync",
+    "--disable-component-update", "--use-gl=swiftshader", "--enable-unsafe-swiftshader",
+)  # fmt: skip
+
+
+@pytest.fixture
+def page(server: RunningServer) -> Iterator[Any]:
+    """The page, loaded; fails the test on any error in its console."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    with playwright.sync_playwright() as browsers:
+        browser = browsers.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        page = browser.new_page(viewport={"width": 1200, "height": 800})
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        # A refused request is an error to the console, and what this page is there to explain.
+        page.on("console", lambda said: errors.append(said.text) if _is_fault(said) else None)
+        page.goto(server.url)
+        yield page
+        browser.close()
+        assert not errors
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    xyz = noisy(torus(POINTS), 0.01).astype("<f4")
+    kinds = "".join(f"property float {name}\n" for name in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {POINTS}\n{kinds}end_header\n"
+    (path := tmp_path / "scan.ply").write_bytes(head.encode() + xyz.tobytes())
+    return path
+
+
+def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.wait_for_selector("#empty", state="hidden")
+    before = _picture(page)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    figures = page.inner_text("#figures")
+    assert f"{POINTS:,}" in figures
+    assert page.is_visible("#legend")
+    page.wait_for_timeout(500)  # a frame or two of the viewer
+    after = _picture(page)
+    assert (before != after).any(axis=2).mean() > 0.02, "the viewer still shows the noisy cloud"
+    with page.expect_download() as download:
+        page.click("#download")
+    download.value.save_as(tmp_path / "clean.ply")
+    clean, _ = read_cloud(tmp_path / "clean.ply")
+    noisy_, _ = read_cloud(scan)
+    assert clean.xyz.shape == (POINTS, 3)
+    assert 0 < np.abs(clean.xyz - noisy_.xyz).max() < 0.2
+
+
+def test_a_broken_file_is_explained_and_the_page_goes_on(page: Any, scan: Path, tmp_path: Path) -> None:
+    (broken := tmp_path / "broken.ply").write_bytes(scan.read_bytes()[:-50])
+    page.set_input_files("#file", broken)
+    page.click("#submit")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "vert" in page.inner_text("#error")
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert page.is_hidden("#error")
+
+
+def _is_fault(said: Any) -> bool:
+    return bool(said.type == "error" and "status of 422" not in said.text)
+
+
+def _picture(page: Any) -> np.ndarray:
+    """Return the viewer's picture, (height, width, 3) uint8."""
+    import io
+
+    from matplotlib.image import imread
+
+    png = page.locator("#canvas").screenshot()
+    return (imread(io.BytesIO(png), format="png")[..., :3] * 255).astype(np.uint8)
