@@ -39,8 +39,8 @@ def install(app: typer.Typer) -> None:
 @contextmanager
 def connect(url: str, api_key: str | None) -> Iterator[Client]:
     """Open a client."""
-    if not url.startswith(("http://", "https://")):
-        raise InvalidOptions(f"--url is {url[:80]!r}; it must begin with http:// or https://")
+    if not url.startswith(("http://", "https://", "grpc://", "grpcs://")):
+        raise InvalidOptions(f"--url is {url[:80]!r}; it must begin with http://, https://, grpc:// or grpcs://")
     from straightpcf.clients.sdk import Client
 
     with Client(url, api_key=api_key) as client:
