@@ -24,7 +24,7 @@ from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise
 from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
-from straightpcf.model.nets.straightpcf import VelocityModule
+from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
 from straightpcf.points.options import DenoiseOptions
 
 Floats = npt.NDArray[np.float64]
@@ -105,7 +105,7 @@ def _runner(options: argparse.Namespace) -> Run:
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
         if not isinstance(module, VelocityModule):
             raise SystemExit("--model official takes the authors' single VelocityModule")
-        model = Filter(_VelocityOnly(module), threads=options.threads)  # type: ignore[arg-type]
+        model = Filter(_alone(module), threads=options.threads, euler_steps=OFFICIAL_STEPS)
     else:
         model = load_filter(options.weights, device=options.device, threads=options.threads)
 
@@ -119,23 +119,17 @@ def _runner(options: argparse.Namespace) -> Run:
     return run
 
 
-class _VelocityOnly(nn.Module):
-    """A lone VelocityModule behind the interface of StraightPCF: the distance is 1, four Euler steps."""
+def _alone(module: VelocityModule) -> StraightPCF:
+    """Put a lone VelocityModule into the whole network, the distance always 1."""
 
-    def __init__(self, module: VelocityModule) -> None:
-        super().__init__()
-        self.module = module
+    class One(nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return x.new_ones(len(x), 1)
 
-    def distance_module(self, x: torch.Tensor) -> torch.Tensor:
-        return x.new_ones(len(x), 1)
-
-    def forward(
-        self, x: torch.Tensor, *, euler_steps: int, rows: int | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        del euler_steps  # the filter's default is that of the whole network
-        for _ in range(OFFICIAL_STEPS - 1):
-            x = x + self.module(x) / OFFICIAL_STEPS
-        return x[:, :rows] + self.module(x, rows) / OFFICIAL_STEPS, x.new_ones(len(x), 1)
+    network = StraightPCF(couplings=1)
+    network.velocity_modules[0] = module
+    network.distance_module = One()  # type: ignore[assignment]
+    return network
 
 
 def _print(row: Row) -> None:

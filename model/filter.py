@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +31,11 @@ DEFAULT_WEIGHTS = Path(__file__).with_name("weights") / "straightpcf.safetensors
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
 EULER_STEPS = 3
 COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RESULTS.md compares)
+FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 _PROBES = 48  # patches on which "auto" reads the noise
 _CUDA_BATCH = 32
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,7 @@ class Filter:
         threads: int | None = None,
         coverage: float = COVERAGE,
         euler_steps: int = EULER_STEPS,
+        full_evaluations: int | None = FULL_EVALUATIONS,
         batch: int | None = None,
     ) -> None:
         self.network = network.eval().requires_grad_(requires_grad=False)
@@ -122,31 +127,37 @@ class Filter:
         self.threads = threads or os.cpu_count() or 1
         self.coverage = coverage
         self.euler_steps = euler_steps
+        self.full_evaluations = full_evaluations
         self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
         keep_large_buffers()
 
-    def move(self, x: torch.Tensor, rows: int) -> npt.NDArray[np.float64]:
-        """Return how far the first `rows` points of each patch move: (B, P, 3) float32 -> (B, rows, 3).
+    def move(self, x: torch.Tensor, owned: npt.NDArray[np.int64]) -> list[npt.NDArray[np.float64]]:
+        """Return how far the first owned[i] points of each patch move: (B, P, 3) float32 -> B x (owned[i], 3).
 
         A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
         is too many.
         """
         moves: list[npt.NDArray[np.float64]] = []
-        done = 0
-        while done < len(x):
-            some, batch = x[done : done + self.batch], self.batch
+        while len(moves) < len(x):
+            some, batch = slice(len(moves), len(moves) + self.batch), self.batch
+            rows = max(1, int(owned[some].max()))
             try:
-                moved, _ = self.network(some, euler_steps=self.euler_steps, rows=rows)
-                moves.append((moved - some[:, :rows]).double().cpu().numpy())
-                done += len(some)
+                moved, _ = self.network(
+                    x[some],
+                    euler_steps=self.euler_steps,
+                    rows=rows,
+                    owned=torch.from_numpy(owned[some]).to(x.device) if self.full_evaluations is not None else None,
+                    full_evaluations=self.full_evaluations or 0,
+                )
+                displacements = (moved - x[some, :rows]).double().cpu().numpy()
             except torch.OutOfMemoryError as exc:
                 if batch == 1:
-                    raise TooLarge(
-                        f"one patch of {x.shape[1]} points does not fit in the memory of {self.device}"
-                    ) from exc
+                    raise TooLarge(f"{self.device} has no memory for a patch of {x.shape[1]} points") from exc
                 self.batch = batch // 2
                 torch.cuda.empty_cache()
-        return np.concatenate(moves)
+            else:
+                moves += [move[:count] for move, count in zip(displacements, owned[some], strict=True)]
+        return moves
 
     def denoise(
         self,
@@ -255,17 +266,14 @@ class Run:
         """Run the network over all patches; yield each one's displacements of the points it owns, in its own scale."""
         step = self.filter.batch
 
-        def move(first: int) -> npt.NDArray[np.float64]:
+        def move(first: int) -> list[npt.NDArray[np.float64]]:
             chosen = range(first, min(first + step, len(cut.seeds)))
-            rows = max(1, int(cut.owned[first : chosen.stop].max()))
-            x = self._tensor(here, cut, scales, chosen)
-            return self.filter.move(x, rows)
+            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop])
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
         for first, displacements in zip(starts, results, strict=True):
-            for patch, displacement in enumerate(displacements, start=first):
-                yield patch, displacement[: cut.owned[patch]]
+            yield from enumerate(displacements, start=first)
 
     def _tensor(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], chosen: range | list[int]
@@ -316,11 +324,9 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _bounded_map(
-    pool: ThreadPoolExecutor, function: Callable[[int], npt.NDArray[np.float64]], items: range, ahead: int
-) -> Iterator[npt.NDArray[np.float64]]:
+def _bounded_map(pool: ThreadPoolExecutor, function: Callable[[int], _T], items: range, ahead: int) -> Iterator[_T]:
     """Map in order with at most `ahead` results waiting, so that a slow reader does not fill the memory."""
-    waiting: deque[Future[npt.NDArray[np.float64]]] = deque()
+    waiting: deque[Future[_T]] = deque()
     try:
         for item in items:
             waiting.append(pool.submit(_inference, function, item))
@@ -333,6 +339,6 @@ def _bounded_map(
             future.cancel()
 
 
-def _inference(function: Callable[[int], npt.NDArray[np.float64]], item: int) -> npt.NDArray[np.float64]:
+def _inference(function: Callable[[int], _T], item: int) -> _T:
     with torch.inference_mode():  # the mode belongs to a thread
         return function(item)

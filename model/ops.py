@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from straightpcf.model.kernels import cpu
+from straightpcf.model.kernels import cpu, cuda
 
 __all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch"]
 
@@ -13,9 +13,11 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
     """Find each point's k nearest others inside its patch.
 
     x: (B, P, C) float32, P > 1; rows: only for the first `rows` points, all if None.
-    Returns (B, rows, k) indices into P, int32 on the CPU and int64 elsewhere. k > P - 1 repeats the farthest.
+    Returns (B, rows, k) indices into P, int32 from the kernels and int64 from torch. k > P - 1 repeats the farthest.
     """
     rows = x.shape[1] if rows is None else rows
+    if x.is_cuda and cuda.load():
+        return cuda.knn(x.detach(), k, rows)
     library = cpu.load() if x.device.type == "cpu" and x.dtype == torch.float32 and k <= 64 else None
     return knn_torch(x, k, rows) if library is None else cpu.knn(library, x, k, rows)
 
@@ -38,11 +40,13 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     a: (B, M, C) the point's own share of the first layer; b: (B, P, C) its neighbours' share;
     index: (B, M, k) into P; weight: (D, C). Returns (B, M, D): max_n weight @ relu(a_i + b_index[i, n]).
     """
+    want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
+    if a.is_cuda and not want_grad and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0 and cuda.load():
+        return cuda.edge_max(a, b, index.int(), weight)
     plain = a.dtype == torch.float32 and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
     library = cpu.load() if plain and a.device.type == "cpu" and index.dtype == torch.int32 else None
     if library is None:
         return edge_max_torch(a, b, index, weight)
-    want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
     return cpu.EdgeMax.apply(library, a, b, index, weight, want_grad)  # type: ignore[no-untyped-call,no-any-return]
 
 

@@ -90,7 +90,6 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
 def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
-    _check_start(settings)
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
     config = uvicorn.Config(
@@ -113,6 +112,7 @@ def serve(settings: Settings) -> None:
             "Set STRAIGHTPCF_API_KEYS or STRAIGHTPCF_API_KEYS_FILE.",
             settings.host,
         )
+    _check_start(settings)
     server.run()
     if backend.failure is not None:
         raise backend.failure

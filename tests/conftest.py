@@ -12,7 +12,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,7 +59,8 @@ class RunningServer:
         """Delete every job, running or not; its files are gone when the answer comes."""
         while jobs := json.loads(self._ask("GET", "/jobs"))["jobs"]:
             for job in jobs:
-                self._ask("DELETE", f"/jobs/{job['id']}")
+                with suppress(urllib.error.HTTPError):  # a POST /denoise that was just answered deletes its own
+                    self._ask("DELETE", f"/jobs/{job['id']}")
 
     def _ask(self, method: str, path: str) -> bytes:
         with urllib.request.urlopen(urllib.request.Request(self.url + path, method=method), timeout=20) as response:

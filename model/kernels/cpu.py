@@ -31,8 +31,10 @@ _INSTRUCTION_SETS = {
     "avx2": "-mavx2 -mfma -mbmi -mbmi2",
     "generic": "",
 }
-# A finite-only mode would let the compiler drop the comparisons that the selection relies on.
-_FLAGS = "-O3 -std=c++17 -fPIC -shared -ffast-math -fno-finite-math-only -Wno-psabi"
+# Sums may be reordered. Not -ffast-math: it lets the compiler drop the comparisons that the selection relies on, and
+# gcc links code into such a library that makes the whole process flush subnormal numbers to zero.
+_REORDER = "-fassociative-math -fno-signed-zeros -fno-trapping-math -fno-math-errno -freciprocal-math"
+_FLAGS = f"-O3 -std=c++17 -fPIC -shared {_REORDER} -Wno-psabi"
 _BUILD_SECONDS = 120
 
 

@@ -53,16 +53,32 @@ class StraightPCF(nn.Module):
         self.distance_module = DistanceModule(distance_width)
 
     def forward(
-        self, x: torch.Tensor, *, euler_steps: int = 3, rows: int | None = None
+        self,
+        x: torch.Tensor,
+        *,
+        euler_steps: int = 3,
+        rows: int | None = None,
+        owned: torch.Tensor | None = None,
+        full_evaluations: int = 1,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
 
         Returns the moved patches (B, P, 3), or their first `rows` points, for which the last evaluation costs
-        less, and their distances d (B, 1).
+        less, and their distances d (B, 1). With `owned`, (B,) at most `rows`, only so many points of each patch have
+        a velocity of every evaluation: the others, there as neighbours, keep that of the last of the first
+        full_evaluations. The flow is straight (section 4.2), so that hardly changes what is seen of them
+        (docs/training.md has the figures).
         """
         distance = self.distance_module(x)
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
         evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
-        for velocity in evaluations[:-1]:
-            x = x + step * velocity(x)
+        moving = torch.zeros_like(x)
+        inside = None if owned is None else torch.arange(rows or x.shape[1], device=x.device) < owned[:, None]
+        for done, velocity in enumerate(evaluations[:-1]):
+            if inside is None or done < full_evaluations:
+                moving = velocity(x)
+            else:
+                fresh = torch.where(inside[:, :, None], velocity(x, rows), moving[:, :rows])
+                moving = torch.cat([fresh, moving[:, inside.shape[1] :]], dim=1)
+            x = x + step * moving
         return x[:, :rows] + step * evaluations[-1](x, rows), distance

@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,12 @@ from straightpcf.points.errors import (
     IdConflict,
     IdempotencyConflict,
     InternalError,
-    InvalidOptions,
     InvalidRequest,
     NotFound,
     StraightPCFError,
 )
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.jobs.database import open_database
 from straightpcf.service.jobs.record import (
     FINISHED,
     STATES,
@@ -41,8 +40,6 @@ from straightpcf.service.jobs.record import (
 
 __all__ = ["JobStore", "Load", "NewJob"]
 
-SCHEMA_VERSION = 1
-_BUSY_SECONDS = 30.0
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
 _PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
@@ -78,28 +75,11 @@ class JobStore:
     """Keep jobs and their events; use from one thread."""
 
     def __init__(self, path: Path) -> None:
-        self._db = sqlite3.connect(path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False)
-        self._db.row_factory = sqlite3.Row
-        self._db.execute("PRAGMA journal_mode = WAL")
-        self._db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
-        self._db.execute("PRAGMA foreign_keys = ON")
-        self._prepare(path)
+        self._db = open_database(path)
 
     def close(self) -> None:
         """Close the file."""
         self._db.close()
-
-    def _prepare(self, path: Path) -> None:
-        (version,) = self._db.execute("PRAGMA user_version").fetchone()
-        if version > SCHEMA_VERSION:
-            raise InvalidOptions(
-                f"{path} has schema {version}, written by a newer straightpcf; this one knows {SCHEMA_VERSION}"
-            )
-        self._db.executescript(files(__package__).joinpath("schema.sql").read_text())
-        columns = {row["name"] for row in self._db.execute("PRAGMA table_info(jobs)")}
-        if "deaths" not in columns:  # before versions were counted
-            self._db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
-        self._db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     # --- what clients ask for
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -161,7 +163,7 @@ class _SmallMemory(torch.nn.Module):
         self.network, self.most = network, most
         self.distance_module = network.distance_module
 
-    def forward(self, x: torch.Tensor, **how: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: torch.Tensor, **how: Any) -> tuple[torch.Tensor, torch.Tensor]:
         if len(x) > self.most:
             raise torch.OutOfMemoryError(f"{len(x)} patches")
         moved, distance = self.network(x, **how)

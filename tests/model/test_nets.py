@@ -44,6 +44,31 @@ def test_the_first_rows_alone_give_what_all_rows_give() -> None:
         torch.testing.assert_close(module(x, 40), module(x)[:, :40])
 
 
+def test_neighbours_may_keep_their_velocity() -> None:
+    torch.manual_seed(0)
+    network, x = StraightPCF(width=128, distance_width=128).eval(), torch.randn(2, 300, 3) * 0.2
+    owned = torch.tensor([40, 25])
+    with torch.inference_mode():
+        whole, _ = network(x, rows=40)
+        torch.testing.assert_close(network(x, rows=40, owned=owned, full_evaluations=5)[0], whole)
+        torch.testing.assert_close(network(x, rows=300, owned=torch.tensor([300, 300]))[0], network(x)[0])
+        first, second = network.velocity_modules
+        fewer, distance = network(x, rows=40, owned=owned, euler_steps=1)
+        step = distance[:, :, None] / 2
+        here = x + step * first(x)
+        torch.testing.assert_close(fewer, here[:, :40] + step * second(here, 40))
+
+
+def test_a_patch_does_not_see_its_batch() -> None:
+    torch.manual_seed(0)
+    network, x = StraightPCF(width=128, distance_width=128).eval(), torch.randn(2, 300, 3) * 0.2
+    owned = torch.tensor([40, 25])
+    with torch.inference_mode():
+        both, _ = network(x, rows=40, owned=owned)
+        alone, _ = network(x[1:], rows=25, owned=owned[1:])
+    torch.testing.assert_close(both[1:, :25], alone)
+
+
 def test_the_distance_lies_between_0_and_1_and_does_not_see_the_scale() -> None:
     torch.manual_seed(0)
     module, x = DistanceModule().eval(), torch.randn(2, 300, 3)

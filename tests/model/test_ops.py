@@ -75,3 +75,10 @@ def test_edge_max_gradient_is_exact_along_the_winning_edges() -> None:
     expected = torch.autograd.grad(ops.edge_max_torch(a, b, index, weight), (a, b, weight), grad)
     for ours, theirs in zip(found, expected, strict=True):
         assert relative_error(ours, theirs) < 1e-5
+
+
+@kernels
+def test_loading_the_kernels_leaves_subnormal_numbers_alone() -> None:
+    cpu.load()
+    assert float(torch.tensor(5e-324, dtype=torch.float64) * 1) == 5e-324
+    assert 2.0**-1074 * 1.0 > 0

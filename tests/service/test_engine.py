@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from straightpcf.points.errors import (
     IdConflict,
     IdempotencyConflict,
     InternalError,
+    InvalidOptions,
     InvalidRequest,
     JobCanceled,
     JobNotFinished,
@@ -32,6 +34,7 @@ from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import WorkerDied
 from straightpcf.service.engine import Engine, JobRequest
 from straightpcf.service.jobs.record import JobRecord
+from straightpcf.service.jobs.store import JobStore
 from tests.service.fakes import CONTENT, ObedientBackend
 
 Scenario = Callable[[Engine, ObedientBackend], Coroutine[Any, Any, None]]
@@ -291,3 +294,10 @@ def test_a_backend_that_can_never_start_says_why_to_every_job(tmp_path: Path) ->
             await submit(engine)
 
     play(tmp_path, scenario)
+
+
+def test_a_file_of_a_newer_schema_is_refused(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "jobs.sqlite3")) as db:
+        db.execute("PRAGMA user_version = 99")
+    with pytest.raises(InvalidOptions, match="99"):
+        JobStore(tmp_path / "jobs.sqlite3")
