@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -15,7 +16,7 @@ from typer.core import TyperGroup
 import straightpcf
 from straightpcf.clients import job_commands
 from straightpcf.clients.console import complain, exit_code, needs, print_json, print_table, progress_bar, show_noise
-from straightpcf.clients.job_commands import Format, Iterations, Key, Seed, Strength
+from straightpcf.clients.job_commands import Format, Iterations, Key, Normals, Seed, Strength
 from straightpcf.points import errors
 
 __all__ = ["app", "main"]
@@ -86,6 +87,7 @@ def denoise(
     device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
     seed: Seed = 0,
     strength: Strength = 1.0,
+    normals: Normals = "keep",
     format: Format = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
@@ -97,7 +99,7 @@ def denoise(
     from straightpcf.points.formats import format_for, format_named
     from straightpcf.points.options import DenoiseOptions
 
-    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength))
+    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
     if format is not None:
         format = format_named(format).name
     elif target != STDIO and target.suffix.lower() != source.suffix.lower():
@@ -110,7 +112,7 @@ def denoise(
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
                 done = client.denoise(
                     path if name else path.read_bytes(), out, iterations=wanted.iterations, seed=seed,
-                    strength=strength, format=format, on_progress=show,
+                    strength=strength, normals=wanted.normals, format=format, on_progress=show,
                 )  # fmt: skip
             report: Any = done.report
         else:
@@ -129,6 +131,7 @@ def watch(
     iterations: Iterations = "auto",
     seed: Seed = 0,
     strength: Strength = 1.0,
+    normals: Normals = "keep",
     device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
@@ -138,7 +141,7 @@ def watch(
     from straightpcf.clients.watch import watch_folder
     from straightpcf.points.options import DenoiseOptions
 
-    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength))
+    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder")
     target = folder / "clean" if target is None else target
@@ -347,7 +350,7 @@ def _one_by_one(
         run = _in_process(device, None, threads)
         yield lambda source, target: run(source, target, source.name, None, wanted)
         return
-    asked = {"iterations": wanted.iterations, "seed": wanted.seed, "strength": wanted.strength}
+    asked = asdict(wanted)
     with job_commands.connect(url, api_key) as client:
         yield lambda source, target: client.denoise(source, target, **asked).report
 

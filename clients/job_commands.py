@@ -27,6 +27,7 @@ Id = Annotated[str, typer.Argument(metavar="ID", help="The job.")]
 Iterations = Annotated[str, typer.Option(metavar="auto|N", help="Passes of the filter.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 Strength = Annotated[float, typer.Option(help="0..1, the share of the displacement to apply.")]
+Normals = Annotated[str, typer.Option(metavar="keep|recompute", help="Of a PLY or PCD file that has some.")]
 Format = Annotated[str | None, typer.Option("--format", help="Of the result (ply, xyz, ...); else the input's.")]
 
 
@@ -52,6 +53,7 @@ def submit(
     iterations: Iterations = "auto",
     seed: Seed = 0,
     strength: Strength = 1.0,
+    normals: Normals = "keep",
     format: Format = None,
     id: Annotated[str | None, typer.Option(help="A name for the job, to make it only once.")] = None,
     url: Url = DEFAULT_URL,
@@ -65,7 +67,7 @@ def submit(
         for source in sources:
             content: Any = sys.stdin.buffer.read() if str(source) == "-" else source
             job = client.jobs.create(
-                content, iterations=iterations, seed=seed, strength=strength, format=format, id=id  # type: ignore[arg-type]
+                content, iterations=iterations, seed=seed, strength=strength, normals=normals, format=format, id=id  # type: ignore[arg-type]
             )  # fmt: skip
             print_json(job.info.json) if as_json else typer.echo(job.id)
 

@@ -21,12 +21,14 @@ class DenoiseOptions:
     iterations: passes of the whole filter, 1..10, or "auto": decided from the cloud itself.
     seed: picks the first patch seed; the same seed gives the same bytes.
     strength: 0..1, the share of the displacement that is applied (1 = the filter's own result).
+    normals: "keep" those of the file, or "recompute" them at the new positions.
     Raises InvalidOptions naming the value and the limit.
     """
 
     iterations: int | Literal["auto"] = "auto"
     seed: int = 0
     strength: float = 1.0
+    normals: Literal["keep", "recompute"] = "keep"
 
     def __post_init__(self) -> None:
         """Validate every field."""
@@ -40,10 +42,17 @@ class DenoiseOptions:
             raise InvalidOptions(f"seed is {self.seed!r}; it must be an integer in 0..{2**32 - 1}")
         if not (isinstance(self.strength, (int, float)) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
             raise InvalidOptions(f"strength is {self.strength!r}; it must be in 0..1")
+        if self.normals not in ("keep", "recompute"):
+            raise InvalidOptions(f'normals is {self.normals!r}; it must be "keep" or "recompute"')
 
     @classmethod
     def parse(
-        cls, *, iterations: str | None = None, seed: str | None = None, strength: str | None = None
+        cls,
+        *,
+        iterations: str | None = None,
+        seed: str | None = None,
+        strength: str | None = None,
+        normals: str | None = None,
     ) -> DenoiseOptions:
         """Read options from text, as forms, query strings and command lines carry them; None keeps the default."""
         default = cls()
@@ -51,6 +60,7 @@ class DenoiseOptions:
             iterations=default.iterations if iterations is None else _iterations(iterations),
             seed=default.seed if seed is None else _number("seed", int, seed),
             strength=default.strength if strength is None else _number("strength", float, strength),
+            normals=default.normals if normals is None else normals.strip().lower(),  # type: ignore[arg-type]
         )
 
 

@@ -13,7 +13,7 @@ from straightpcf.clients.sdk.events import Event
 from straightpcf.clients.sdk.flows import OnProgress
 from straightpcf.clients.sdk.job_info import JobInfo, JobState
 from straightpcf.clients.sdk.receive import Events, Patches
-from straightpcf.clients.sdk.request import Iterations, Source, events_call, patches_call
+from straightpcf.clients.sdk.request import Iterations, Normals, Source, events_call, patches_call
 from straightpcf.clients.sdk.response import Health, ServerInfo
 from straightpcf.clients.sdk.result import Denoised
 from straightpcf.clients.sdk.retry import MAX_RETRIES
@@ -57,13 +57,14 @@ class AsyncClient:
         iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
+        normals: Normals = "keep",
         format: str | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Denoised:
         """Do as `Client.denoise`; on_progress is an ordinary function."""
         path = None if target is None else Path(target)
-        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "format": format}
+        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "normals": normals, "format": format}
         return await self._transport.run(flows.denoise(source, path, on_progress, timeout, **wanted))
 
     async def health(self) -> Health:
@@ -88,6 +89,7 @@ class AsyncJobs:
         iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
+        normals: Normals = "keep",
         format: str | None = None,
         name: str | None = None,
         id: str | None = None,
@@ -95,8 +97,8 @@ class AsyncJobs:
     ) -> AsyncJob:
         """Do as `Jobs.create`."""
         flow = flows.create(
-            source, iterations=iterations, seed=seed, strength=strength, format=format, name=name, id=id,
-            key=idempotency_key,
+            source, iterations=iterations, seed=seed, strength=strength, normals=normals, format=format,
+            name=name, id=id, key=idempotency_key,
         )  # fmt: skip
         return AsyncJob(self._transport, await self._transport.run(flow))
 

@@ -12,7 +12,7 @@ from straightpcf.clients.sdk.events import Event
 from straightpcf.clients.sdk.flows import OnProgress
 from straightpcf.clients.sdk.job_info import JobInfo, JobState
 from straightpcf.clients.sdk.receive import Events, Patches
-from straightpcf.clients.sdk.request import Iterations, Source, events_call, patches_call
+from straightpcf.clients.sdk.request import Iterations, Normals, Source, events_call, patches_call
 from straightpcf.clients.sdk.response import Health, ServerInfo
 from straightpcf.clients.sdk.result import Denoised
 from straightpcf.clients.sdk.retry import MAX_RETRIES
@@ -62,6 +62,7 @@ class Client:
         iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
+        normals: Normals = "keep",
         format: str | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
@@ -70,12 +71,13 @@ class Client:
 
         source: a path, the bytes of a file, an (N, 3) array, or an open3d cloud.
         target: where to write the result, complete or not at all; by default it is held in memory.
+        normals: "recompute" them at the new positions, where a PLY or PCD file has some.
         format: of the result; by default that of the target's name, else that of the source.
         timeout: seconds after which JobNotFinished is raised. on_progress: called with the share that is done, 0..1.
         Raises the StraightPCFError that the server met. Whatever ends this early ends the work on the server too.
         """
         path = None if target is None else Path(target)
-        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "format": format}
+        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "normals": normals, "format": format}
         return self._transport.run(flows.denoise(source, path, on_progress, timeout, **wanted))
 
     def health(self) -> Health:
@@ -100,6 +102,7 @@ class Jobs:
         iterations: Iterations = "auto",
         seed: int = 0,
         strength: float = 1.0,
+        normals: Normals = "keep",
         format: str | None = None,
         name: str | None = None,
         id: str | None = None,
@@ -111,8 +114,8 @@ class Jobs:
         same request with the same id, or with the same idempotency_key, finds the job that it made before.
         """
         flow = flows.create(
-            source, iterations=iterations, seed=seed, strength=strength, format=format, name=name, id=id,
-            key=idempotency_key,
+            source, iterations=iterations, seed=seed, strength=strength, normals=normals, format=format,
+            name=name, id=id, key=idempotency_key,
         )  # fmt: skip
         return Job(self._transport, self._transport.run(flow))
 

@@ -24,6 +24,7 @@ __all__ = [
     "CHUNK_BYTES",
     "Call",
     "Iterations",
+    "Normals",
     "Source",
     "cancel_call",
     "delete_call",
@@ -41,6 +42,7 @@ CHUNK_BYTES = 2**18
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.
 Source: TypeAlias = str | Path | bytes | npt.NDArray[Any] | Any
 Iterations: TypeAlias = int | Literal["auto"]
+Normals: TypeAlias = Literal["keep", "recompute"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,7 @@ def upload_call(
     iterations: Iterations | str,
     seed: int,
     strength: float,
+    normals: Normals | str = "keep",
     format: str | None,
     name: str | None = None,
     key: str | None = None,
@@ -98,14 +101,16 @@ def upload_call(
 
     Raises InvalidOptions, InvalidCloud, UnknownFormat, OSError before anything is sent.
     """
-    options = DenoiseOptions.parse(iterations=str(iterations), seed=str(seed), strength=str(strength))
+    options = DenoiseOptions.parse(
+        iterations=str(iterations), seed=str(seed), strength=str(strength), normals=str(normals)
+    )
     if target is not None and not target.parent.is_dir():
         raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
     own_name, body = _name_and_body(source)
     name = name or own_name
     if format is None and target is not None and target.suffix.lower() != Path(name or "").suffix.lower():
         format = format_for(target.name).name
-    params = {"iterations": str(options.iterations), "seed": str(options.seed), "strength": str(options.strength)}
+    params = {name: str(value) for name, value in asdict(options).items()}
     if name is not None:
         params["filename"] = name
     if format is not None:

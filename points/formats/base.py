@@ -25,6 +25,7 @@ class Format(ABC):
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]
     media_type: ClassVar[str] = "application/octet-stream"
+    writes_normals: ClassVar[bool] = False  # that were recomputed, in the place of the file's own
     has_magic: ClassVar[bool] = True  # False: only the file's suffix says what it is
 
     @abstractmethod

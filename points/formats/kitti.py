@@ -11,7 +11,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats.base import Format, check_count
-from straightpcf.points.formats.positions import narrowed, put_positions, widened
+from straightpcf.points.formats.positions import AXES, narrowed, put_positions, widened
 
 __all__ = ["Kitti"]
 
@@ -57,7 +57,7 @@ class Kitti(Format):
         if isinstance(source, KittiSource):
             out = bytearray(source.raw)
             rows = np.frombuffer(out, "<f4").reshape(-1, 4)
-            put_positions([rows[:, axis] for axis in range(3)], cloud.xyz, source.xyz)
+            put_positions({name: rows[:, axis] for axis, name in enumerate(AXES)}, cloud.xyz, source.xyz)
             path.write_bytes(out)
             return
         table = np.zeros((len(cloud), 4), "<f4")

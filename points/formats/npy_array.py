@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_count, check_room
-from straightpcf.points.formats.positions import put_positions
+from straightpcf.points.formats.positions import AXES, put_positions
 
 __all__ = ["HEADER_BYTES", "MAGIC", "NpyHeader", "new_array", "patched", "positions_header", "read_header", "view"]
 
@@ -111,7 +111,7 @@ def patched(
         return raw
     out = bytearray(raw)
     table = view(out, header)
-    put_positions([table[:, axis] for axis in range(3)], new, old)
+    put_positions({name: table[:, axis] for axis, name in enumerate(AXES)}, new, old)
     return out
 
 

@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.pcd_header import PcdHeader, read_header
-from straightpcf.points.formats.positions import AXES, moved, put_positions, widened
+from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
 __all__ = ["Pcd"]
 
+_NORMAL_FIELDS = frozenset(name for names in NORMALS for name in names)
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 
 
@@ -28,14 +29,14 @@ _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 class PcdSource:
     """Hold the file, its parsed header and the positions that were read from it.
 
-    starts, ends: (N, 3) int64 byte offsets of the tokens of a text file.  unpacked: of a compressed one.
+    tokens: where those of a text file begin and end, (N,) int64 byte offsets of each axis and of the normals.
+    unpacked: of a compressed one.
     """
 
     raw: bytes
     header: PcdHeader
     xyz: npt.NDArray[np.float64]
-    starts: npt.NDArray[np.int64] | None = None
-    ends: npt.NDArray[np.int64] | None = None
+    tokens: dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] | None = None
     unpacked: bytes | None = None
 
 
@@ -45,6 +46,7 @@ class Pcd(Format):
     name = "pcd"
     suffixes = (".pcd",)
     media_type = "application/vnd.pcl.pcd"
+    writes_normals = True
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the comment that PCL writes, or the first keyword after comments."""
@@ -71,16 +73,19 @@ class Pcd(Format):
         source = cloud.source
         if not isinstance(source, PcdSource):
             path.write_bytes(_new_file(cloud))
-        elif not moved(cloud.xyz, source.xyz).any():
+            return
+        names, new, old = changes(cloud, source.xyz)
+        if not moved(new, old).any():
             path.write_bytes(source.raw)
-        elif source.starts is not None and source.ends is not None:
-            path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
+        elif source.tokens is not None:
+            starts = np.stack([source.tokens[name][0] for name in names], axis=1)
+            ends = np.stack([source.tokens[name][1] for name in names], axis=1)
+            path.write_bytes(replaced(source.raw, starts, ends, new, old))
         elif source.unpacked is not None:
-            path.write_bytes(_repacked(source, source.unpacked, cloud.xyz))
+            path.write_bytes(_repacked(source, source.unpacked, names, new, old))
         else:
             out = bytearray(source.raw)
-            columns = _columns(out, source.header)
-            put_positions([columns[axis] for axis in AXES], cloud.xyz, source.xyz)
+            put_positions(_columns(out, source.header), new, old, names)
             path.write_bytes(out)
 
 
@@ -120,10 +125,15 @@ def _planes(unpacked: bytes | bytearray, header: PcdHeader) -> dict[str, npt.NDA
     return columns
 
 
-def _repacked(source: PcdSource, unpacked: bytes, xyz: npt.NDArray[np.float64]) -> bytes:
+def _repacked(
+    source: PcdSource,
+    unpacked: bytes,
+    names: tuple[str, ...],
+    new: npt.NDArray[np.float64],
+    old: npt.NDArray[np.float64],
+) -> bytes:
     out = bytearray(unpacked)
-    columns = _planes(out, source.header)
-    put_positions([columns[axis] for axis in AXES], xyz, source.xyz)
+    put_positions(_planes(out, source.header), new, old, names)
     packed = lzf.compress(bytes(out))
     begin = source.header.size
     (packed_size,) = struct.unpack_from("<I", source.raw, begin)
@@ -140,7 +150,8 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         what=f"PCD data of {header.points} points with {width} values",
     )
     parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
-    starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+    kept = {field.label for field in header.fields if field.label in AXES or field.label in _NORMAL_FIELDS}
+    tokens: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]] = {name: [] for name in kept}
     left, line = header.points, header.lines + 1
     for lines, _ in blocks(raw, header.size) if left else ():
         filled = np.flatnonzero(lines.counts)[:left]  # PCL skips blank lines
@@ -163,8 +174,8 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
                 raise MalformedFile(f"line {number}: {field.label} is {token}, no {field.dtype.name}")
             parts[field.label].append(values if field.count == 1 else values.reshape(-1, field.count))
             at += field.count
-        starts.append(np.stack([columns[axis][0] for axis in AXES], axis=1))
-        ends.append(np.stack([columns[axis][1] for axis in AXES], axis=1))
+        for name in kept:
+            tokens[name].append(columns[name])
         left -= len(rows)
         if left == 0:
             break
@@ -177,14 +188,19 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         for field in header.fields
     }
     xyz = widened([found[axis] for axis in AXES])
-    source = PcdSource(raw, header, xyz.copy(), np.concatenate(starts), np.concatenate(ends))
+    none = np.empty(0, np.int64)
+    where = {
+        name: (np.concatenate([none, *(p[0] for p in parts)]), np.concatenate([none, *(p[1] for p in parts)]))
+        for name, parts in tokens.items()
+    }
+    source = PcdSource(raw, header, xyz.copy(), where)
     return PointCloud(xyz, _attributes(found), source)
 
 
 def _new_file(cloud: PointCloud) -> bytes:
     """Write a binary file with double positions and every attribute as fields of one value."""
     columns = {axis: cloud.xyz[:, column].astype("<f8") for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(cloud.attributes, _TYPES, taken=AXES)
+    columns |= scalar_columns(cloud.new_attributes(), _TYPES, taken=AXES)
     table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values

@@ -14,7 +14,16 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.ply_header import PlyElement, PlyHeader, read_header
 from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows
-from straightpcf.points.formats.positions import AXES, gathered, moved, narrowed, put_positions, scattered, widened
+from straightpcf.points.formats.positions import (
+    AXES,
+    changes,
+    gathered,
+    moved,
+    narrowed,
+    put_positions,
+    scattered,
+    widened,
+)
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import refuse_binary, replaced
 
@@ -41,6 +50,7 @@ class Ply(Format):
     name = "ply"
     suffixes = (".ply",)
     media_type = "application/vnd.ply"
+    writes_normals = True
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the first line."""
@@ -64,11 +74,12 @@ class Ply(Format):
         if not isinstance(source, PlySource):
             path.write_bytes(_new_file(cloud))
         elif isinstance(source.rows, AsciiRows):
-            starts = np.stack([source.rows.starts[axis] for axis in AXES], axis=1)
-            ends = np.stack([source.rows.ends[axis] for axis in AXES], axis=1)
-            path.write_bytes(replaced(source.raw, starts, ends, cloud.xyz, source.xyz))
+            names, new, old = changes(cloud, source.xyz)
+            starts = np.stack([source.rows.starts[name] for name in names], axis=1)
+            ends = np.stack([source.rows.ends[name] for name in names], axis=1)
+            path.write_bytes(replaced(source.raw, starts, ends, new, old))
         else:
-            path.write_bytes(_patched(source, source.rows, cloud.xyz))
+            path.write_bytes(_patched(source, source.rows, *changes(cloud, source.xyz)))
 
 
 def _vertex(header: PlyHeader) -> PlyElement:
@@ -113,27 +124,33 @@ def _values(raw: bytes, vertex: PlyElement, rows: BinaryRows) -> dict[str, npt.N
     return {p.name: gathered(raw, rows.offsets[p.name], p.dtype) for p in scalars}
 
 
-def _patched(source: PlySource, rows: BinaryRows, xyz: npt.NDArray[np.float64]) -> bytes | bytearray:
-    changed = moved(xyz, source.xyz)
+def _patched(
+    source: PlySource,
+    rows: BinaryRows,
+    names: tuple[str, ...],
+    new: npt.NDArray[np.float64],
+    old: npt.NDArray[np.float64],
+) -> bytes | bytearray:
+    changed = moved(new, old)
     if not changed.any():
         return source.raw
     out = bytearray(source.raw)
     if rows.fixed is not None:
         table = np.frombuffer(out, rows.fixed.dtype, len(rows.fixed), source.begin)
-        put_positions([table[axis] for axis in AXES], xyz, source.xyz)
+        put_positions({name: table[name] for name in names}, new, old, names)
         return out
     kinds = {p.name: p.dtype for p in source.vertex.properties}
-    for column, axis in enumerate(AXES):
+    for column, name in enumerate(names):
         picked = changed[:, column]
-        values = narrowed(xyz[picked, column], kinds[axis], what=f"the new {axis}")
-        scattered(out, rows.offsets[axis][picked], values)
+        values = narrowed(new[picked, column], kinds[name], what=f"the new {name}")
+        scattered(out, rows.offsets[name][picked], values)
     return out
 
 
 def _new_file(cloud: PointCloud) -> bytes:
     """Write binary little-endian with double positions and every attribute as scalar properties."""
     columns = {axis: cloud.xyz[:, column] for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(cloud.attributes, _NAMES, taken=AXES)
+    columns |= scalar_columns(cloud.new_attributes(), _NAMES, taken=AXES)
     lines = ["ply", "format binary_little_endian 1.0", "comment written by straightpcf", f"element vertex {len(cloud)}"]
     lines += [f"property {_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     table = np.empty(len(cloud), [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()])

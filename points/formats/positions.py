@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 
-__all__ = ["AXES", "gathered", "moved", "narrowed", "number_text", "put_positions", "scattered", "widened"]
+__all__ = ["AXES", "changes", "gathered", "moved", "narrowed", "number_text", "put_positions", "scattered", "widened"]
 
 AXES = "xyz"
 
 
+def changes(
+    cloud: PointCloud, xyz: npt.NDArray[np.float64]
+) -> tuple[tuple[str, ...], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return what a file must hold in the place of what was read: the names of C columns, new (N, C), old (N, C).
+
+    xyz: (N, 3) as read. The columns are the axes, and the normals where the cloud has new ones.
+    """
+    if cloud.normals is None:
+        return tuple(AXES), cloud.xyz, xyz
+    new, old = np.hstack([cloud.xyz, cloud.normals]), np.hstack([xyz, cloud.old_normals()])
+    return (*AXES, *cloud.normal_names), new, old
+
+
 def moved(new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Return (N, 3) bool: which coordinates differ; NaN equals NaN, so that what is stored keeps its bits."""
+    """Return (N, C) bool: which numbers differ; NaN equals NaN, so that what is stored keeps its bits."""
     changed: npt.NDArray[np.bool_] = new != old
     changed &= ~(np.isnan(new) & np.isnan(old))
     return changed
@@ -39,13 +53,16 @@ def narrowed(values: npt.NDArray[np.float64], dtype: np.dtype[Any], *, what: str
 
 
 def put_positions(
-    columns: Sequence[npt.NDArray[Any]], new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]
+    columns: Mapping[str, npt.NDArray[Any]],
+    new: npt.NDArray[np.float64],
+    old: npt.NDArray[np.float64],
+    names: Sequence[str] = AXES,
 ) -> None:
-    """Overwrite the moved coordinates in `columns`, three writable (N,) float views of the file's own bytes."""
+    """Overwrite what changed in the named `columns`, writable (N,) float views of the file's own bytes."""
     changed = moved(new, old)
-    for axis, column in enumerate(columns):
-        rows = np.flatnonzero(changed[:, axis])
-        column[rows] = narrowed(new[rows, axis], column.dtype, what=f"the new {AXES[axis]}")
+    for at, name in enumerate(names):
+        rows, column = np.flatnonzero(changed[:, at]), columns[name]
+        column[rows] = narrowed(new[rows, at], column.dtype, what=f"the new {name}")
 
 
 def gathered(raw: bytes, offsets: npt.NDArray[np.int64], dtype: np.dtype[Any]) -> npt.NDArray[Any]:

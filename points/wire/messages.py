@@ -36,6 +36,7 @@ def plain_of(message: Message) -> dict[str, Any]:
             "iterations": message.iterations if message.HasField("iterations") else "auto",
             "seed": message.seed,
             "strength": message.strength if message.HasField("strength") else 1.0,
+            "normals": "recompute" if message.recompute_normals else "keep",
         }
     return {field.name: _plain_field(message, field) for field in message.DESCRIPTOR.fields}
 
@@ -100,7 +101,10 @@ def _fill(message: Message, values: Mapping[str, Any]) -> None:
 def _options(options: Mapping[str, Any]) -> pb.DenoiseOptions:
     iterations = options["iterations"]
     return pb.DenoiseOptions(
-        iterations=None if iterations == "auto" else iterations, seed=options["seed"], strength=options["strength"]
+        iterations=None if iterations == "auto" else iterations,
+        seed=options["seed"],
+        strength=options["strength"],
+        recompute_normals=options["normals"] == "recompute",
     )
 
 

@@ -31,14 +31,16 @@ JOB_STATE_CANCELED: JobState
 JOB_STATE_EXPIRED: JobState
 
 class DenoiseOptions(_message.Message):
-    __slots__ = ("iterations", "seed", "strength")
+    __slots__ = ("iterations", "seed", "strength", "recompute_normals")
     ITERATIONS_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     STRENGTH_FIELD_NUMBER: _ClassVar[int]
+    RECOMPUTE_NORMALS_FIELD_NUMBER: _ClassVar[int]
     iterations: int
     seed: int
     strength: float
-    def __init__(self, iterations: _Optional[int] = ..., seed: _Optional[int] = ..., strength: _Optional[float] = ...) -> None: ...
+    recompute_normals: bool
+    def __init__(self, iterations: _Optional[int] = ..., seed: _Optional[int] = ..., strength: _Optional[float] = ..., recompute_normals: _Optional[bool] = ...) -> None: ...
 
 class JobConfig(_message.Message):
     __slots__ = ("options", "filename", "format", "id")

@@ -16,7 +16,7 @@ from straightpcf.service.jobs.record import JobRecord
 
 __all__ = ["checked_key", "file_name", "flag", "take_job"]
 
-OPTION_FIELDS = frozenset({"iterations", "seed", "strength"})
+OPTION_FIELDS = frozenset({"iterations", "seed", "strength", "normals"})
 KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
 MAX_NAME_LENGTH = 120
 MAX_KEY_LENGTH = 255

@@ -51,6 +51,12 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "minimum": 0,
         "maximum": 1,
     },
+    "normals": {
+        "description": "Keep the file's normals, or recompute them at the new positions (PLY and PCD).",
+        "type": "string",
+        "default": "keep",
+        "enum": ["keep", "recompute"],
+    },
     "format": {
         "description": "The format of the result; by default that of the input.",
         "type": "string",

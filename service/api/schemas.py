@@ -60,6 +60,7 @@ class JobOptions(BaseModel):
     iterations: int | Literal["auto"]
     seed: int
     strength: float
+    normals: Literal["keep", "recompute"]
 
 
 class JobError(BaseModel):
@@ -178,7 +179,7 @@ class Job(BaseModel):
                 "state": "processing",
                 "name": "scan.ply",
                 "format": None,
-                "options": {"iterations": "auto", "seed": 0, "strength": 1.0},
+                "options": {"iterations": "auto", "seed": 0, "strength": 1.0, "normals": "keep"},
                 "bytes": 600_212,
                 "points": None,
                 "progress": 0.42,

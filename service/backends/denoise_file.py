@@ -13,7 +13,10 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import UnsupportedCloud
+from straightpcf.points.formats import FORMATS, format_named, read_cloud, write_cloud
+from straightpcf.points.formats.base import Format
 from straightpcf.points.wire.patches import encode_end, encode_frame, encode_header
 from straightpcf.service.backends.base import FileJob, FileReport
 
@@ -36,10 +39,13 @@ def denoise_file(
     The target is on the disk, not only in its cache, when this returns.
     """
     from straightpcf.model.filter import Run
+    from straightpcf.model.normals import recompute_normals
 
     began = time.monotonic()
     cloud, source_format = read_cloud(job.source, name=job.name, max_points=job.max_points)
     target_format = source_format if job.format is None else format_named(job.format)
+    if job.options.normals == "recompute":
+        _check_normals(cloud, target_format)
     if on_progress is not None:
         on_progress(0.0, 0)
     was_read = time.monotonic()
@@ -61,7 +67,10 @@ def denoise_file(
         if patches is not None:
             patches.write(encode_end(result.iterations))
     was_filtered = time.monotonic()
-    write_cloud(cloud.with_xyz(result.xyz), job.target, target_format)
+    clean = cloud.with_xyz(result.xyz)
+    if job.options.normals == "recompute":
+        clean = clean.with_normals(recompute_normals(clean.xyz, clean.old_normals()))
+    write_cloud(clean, job.target, target_format)
     size, sha256 = _settle(job.target)
     ended = time.monotonic()
     return FileReport(
@@ -124,6 +133,14 @@ class _Preview:
         if self._tell is not None and self._iteration > 0:
             known = np.isfinite(self._xyz).all(axis=1)
             self._tell(self._iteration, self._rows[known].tolist(), self._xyz[known].tolist())
+
+
+def _check_normals(cloud: PointCloud, target: Format) -> None:
+    if not cloud.normal_names:
+        raise UnsupportedCloud("normals=recompute wants a file with normals (nx ny nz, or normal_x normal_y normal_z)")
+    if not target.writes_normals:
+        able = ", ".join(format.name for format in FORMATS if format.writes_normals)
+        raise UnsupportedCloud(f"normals=recompute is for {able}; the result would be {target.name}")
 
 
 def _displacement(before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]) -> dict[str, float]:

@@ -142,6 +142,10 @@ class JobRunner:
             finally:
                 await log.close()
             result = _result_info(record.name, report)
+            logger.info(
+                "job %s: %d points, %d passes on %s, %.2f s%s", record.id, report.points, report.iterations,
+                report.device, report.seconds, _trace(record.traceparent),
+            )  # fmt: skip
             await self._call(
                 JobStore.succeed, record.id, fence, result=result, report=_report(report), file=target.name,
                 expires_in=self._ttl,
@@ -149,6 +153,7 @@ class JobRunner:
         except WorkerDied as death:
             await self._after_death(claim, death)
         except StraightPCFError as error:
+            logger.info("job %s: %s: %s%s", record.id, error.code, error.message, _trace(record.traceparent))
             await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
         except asyncio.CancelledError:
             reason = self._running[record.id].reason
@@ -220,6 +225,10 @@ class _Log:
             function, args, kwargs = told
             await self._call(function, self._id, self._fence, *args, **kwargs)
             self._notify(self._id)
+
+
+def _trace(traceparent: str | None) -> str:
+    return "" if traceparent is None else f" [traceparent {traceparent[:64]!r}]"
 
 
 def _result_info(name: str | None, report: FileReport) -> ResultInfo:

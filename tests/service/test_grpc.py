@@ -183,7 +183,8 @@ def test_a_call_that_ends_early_frees_the_worker_and_leaves_nothing(
 def test_health_and_reflection_answer(channel: Any) -> None:
     check = health_pb2_grpc.HealthStub(channel).Check
     for service in ("", "straightpcf.v1.DenoiseService"):
-        assert check(health_pb2.HealthCheckRequest(service=service)).status == health_pb2.HealthCheckResponse.SERVING
+        request = health_pb2.HealthCheckRequest(service=service)
+        _wait_for(lambda: check(request).status == health_pb2.HealthCheckResponse.SERVING)  # noqa: B023
     ask = reflection_pb2.ServerReflectionRequest
     questions = iter([ask(list_services=""), ask(file_containing_symbol="straightpcf.v1.DenoiseService")])
     names, file = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(questions)
@@ -219,8 +220,8 @@ def test_messages_keep_what_json_says() -> None:
     assert event_of(message) == ("preview", 5, preview)
     assert plain_of(message)["at"] == "2026-11-21T12:00:00.123Z"
     for options in (
-        {"iterations": "auto", "seed": 0, "strength": 1.0},
-        {"iterations": 3, "seed": 9, "strength": 0.0},
+        {"iterations": "auto", "seed": 0, "strength": 1.0, "normals": "keep"},
+        {"iterations": 3, "seed": 9, "strength": 0.0, "normals": "recompute"},
     ):
         job = plain_of(message_of(pb.Job, {"options": options, "state": "canceled", "name": None}))
         assert (job["options"], job["state"], job["name"]) == (options, "canceled", None)

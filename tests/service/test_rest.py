@@ -392,3 +392,21 @@ def _wait_for(condition: Any, seconds: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "not within the time"
         time.sleep(0.02)
+
+
+def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer) -> None:
+    xyz = noisy(sphere(POINTS), 0.01)
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    lines = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {POINTS}",
+        *(f"property float {name}" for name in names), "end_header", "",
+    ]  # fmt: skip
+    body = "\n".join(lines).encode() + np.hstack([xyz, xyz]).astype("<f4").tobytes()
+    query = f"{server.url}/denoise?iterations=1&normals=recompute"
+    answer = curl("--data-binary", "@-", query, stdin=body)
+    table = np.frombuffer(answer.body[-len(np.hstack([xyz, xyz]).astype("<f4").tobytes()) :], "<f4").reshape(-1, 6)
+    np.testing.assert_allclose(np.linalg.norm(table[:, 3:], axis=1), 1.0, atol=1e-5)
+    assert ((table[:, :3] * table[:, 3:]).sum(axis=1) > 0).all()
+    for bad in (f"{query}&format=xyz", f"{server.url}/denoise?normals=flip"):
+        assert curl("--data-binary", "@-", bad, stdin=body).problem()["status"] == 422
+    assert curl("--data-binary", "@-", query, stdin=_npy(xyz)).problem()["code"] == "unsupported_cloud"

@@ -59,10 +59,11 @@ export class Form {
   }
 
   query() {
-    const { iterations, strength, seed, format } = this.parts;
+    const { iterations, strength, seed, normals, format } = this.parts;
     const query = new URLSearchParams({
       filename: this.file.name, iterations: iterations.value, strength: strength.value, seed: seed.value,
     });
+    if (normals.value !== "keep") query.set("normals", normals.value);
     if (format.value) query.set("format", format.value);
     return query;
   }
