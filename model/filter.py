@@ -131,8 +131,12 @@ class Filter:
         self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
         keep_large_buffers()
 
-    def move(self, x: torch.Tensor, owned: npt.NDArray[np.int64]) -> list[npt.NDArray[np.float64]]:
+    def move(
+        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor | None = None
+    ) -> list[npt.NDArray[np.float64]]:
         """Return how far the first owned[i] points of each patch move: (B, P, 3) float32 -> B x (owned[i], 3).
+
+        distance: (B, 1), where the DistanceModule has been asked before.
 
         A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
         is too many.
@@ -148,6 +152,7 @@ class Filter:
                     rows=rows,
                     owned=torch.from_numpy(owned[some]).to(x.device) if self.full_evaluations is not None else None,
                     full_evaluations=self.full_evaluations or 0,
+                    distance=None if distance is None else distance[some],
                 )
                 displacements = (moved - x[some, :rows]).double().cpu().numpy()
             except torch.OutOfMemoryError as exc:
@@ -202,6 +207,7 @@ class Run:
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.noise = [0.0, 0.0]
         self.distances: list[float] = []
+        self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes
         self.moves: list[float] = []  # the median displacement of each pass, in the frame the network sees
 
     def patches(self) -> Iterator[FinishedPatch]:
@@ -268,7 +274,9 @@ class Run:
 
         def move(first: int) -> list[npt.NDArray[np.float64]]:
             chosen = range(first, min(first + step, len(cut.seeds)))
-            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop])
+            known = [self.probed[i] for i in chosen if i in self.probed]
+            distance = torch.tensor(known, device=self.filter.device)[:, None] if len(known) == len(chosen) else None
+            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop], distance)
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
@@ -292,6 +300,7 @@ class Run:
                 return float(self.filter.network.distance_module(self._tensor(here, cut, scales, [patch])))
 
         distances = np.array(list(pool.map(read, probes)))
+        self.probed = dict(zip(probes, distances.tolist(), strict=True))
         self.distances.append(float(np.median(distances)))
         return float(np.median(self.filter.calibration.noise_std(distances) / scales[probes]))
 

@@ -47,9 +47,102 @@ inline void distances(const float* columns, int padded, const float* queries, in
   }
 }
 
+// What `select` needs beside its arguments: the candidates of one query, a vector longer than a patch.
+struct Candidates {
+  std::vector<float> distance;
+  std::vector<int32_t> index;
+  std::vector<uint64_t> keys;
+  explicit Candidates(int padded) : distance(padded + LANES), index(padded + LANES), keys(padded) {}
+};
+
+#if defined(__AVX512F__)
+
+// How many of `count` vectors' floats are at most the one whose bits are `bits`; floats >= 0 order as their bits do.
+inline int at_most(const float* values, int count, int32_t bits) {
+  const __m512i limit = _mm512_set1_epi32(bits);
+  int found = 0;
+  for (int n = 0; n < count; ++n)
+    found += __builtin_popcount(_mm512_cmple_epi32_mask(_mm512_loadu_si512(values + n * LANES), limit));
+  return found;
+}
+
+// Indices of the k smallest distances (ties go to the lower index), in no particular order.
+// The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates;
+// both thresholds are found by bisection over the bits, which no branch predictor can get wrong.
+inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
+  int32_t bound;
+  std::memcpy(&bound, &FAR, 4);
+  if (k <= 4 * LANES) {
+    float least[4 * LANES];
+    for (int g = 0; g < 4; ++g) {
+      __m512 m = _mm512_loadu_ps(distance + g * LANES);
+      for (int j = (g + 4) * LANES; j < padded; j += 4 * LANES) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
+      _mm512_storeu_ps(least + g * LANES, m);
+    }
+    int32_t low = -1;
+    for (int tries = 0; tries < 18; ++tries) {  // any bound that k of them reach will do
+      const int32_t middle = low + (bound - low) / 2;
+      const int found = at_most(least, 4, middle);
+      (found >= k ? bound : low) = middle;
+      if (found == k) break;
+    }
+  }
+  const __m512i limit = _mm512_set1_epi32(bound), far = _mm512_castps_si512(_mm512_set1_ps(FAR));
+  const __m512i step = _mm512_set1_epi32(LANES);
+  __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  int count = 0;
+  for (int j = 0; j < padded; j += LANES, index = _mm512_add_epi32(index, step)) {
+    const __m512i d = _mm512_loadu_si512(distance + j);
+    const __mmask16 chosen = _mm512_cmple_epi32_mask(d, limit) & _mm512_cmplt_epi32_mask(d, far);
+    _mm512_storeu_si512(&near.distance[count], _mm512_maskz_compress_epi32(chosen, d));
+    _mm512_storeu_si512(&near.index[count], _mm512_maskz_compress_epi32(chosen, index));
+    count += __builtin_popcount(chosen);
+  }
+  if (count <= k) {  // fewer points than neighbours: in order, then the farthest again
+    for (int n = 0; n < count; ++n) {
+      uint32_t bits;
+      std::memcpy(&bits, &near.distance[n], 4);
+      near.keys[n] = (uint64_t(bits) << 32) | uint32_t(near.index[n]);
+    }
+    std::sort(near.keys.begin(), near.keys.begin() + count);
+    for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
+    return;
+  }
+  _mm512_storeu_si512(&near.distance[count], far);
+  const int vectors = (count + LANES - 1) / LANES;
+  int32_t low = -1, high = bound;
+  int reached = count;
+  while (reached != k && high - low > 1) {
+    const int32_t middle = low + (high - low) / 2;
+    const int found = at_most(near.distance.data(), vectors, middle);
+    if (found >= k) {
+      high = middle;
+      reached = found;
+    } else {
+      low = middle;
+    }
+  }
+  const int32_t sure = reached == k ? high : low;  // else some lie exactly at `high`, and not all of them fit
+  int taken = 0;
+  for (int n = 0; n < count; ++n) {
+    int32_t bits;
+    std::memcpy(&bits, &near.distance[n], 4);
+    out[taken] = near.index[n];
+    taken += bits <= sure && taken < k;
+    if (taken == k) return;
+  }
+  for (int n = 0; taken < k; ++n) {
+    int32_t bits;
+    std::memcpy(&bits, &near.distance[n], 4);
+    if (bits == high) out[taken++] = near.index[n];
+  }
+}
+
+#else
+
 // Indices of the k smallest distances (ties go to the lower index), in no particular order.
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few keys.
-inline void select(const float* distance, int padded, int k, std::vector<uint64_t>& keys, int32_t* out) {
+inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
   float bound = FAR;
   if (k <= 4 * LANES) {
     float least[4 * LANES];
@@ -65,26 +158,19 @@ inline void select(const float* distance, int padded, int k, std::vector<uint64_
     bound = least[k - 1];
   }
   int count = 0;
-  const auto keep = [&](int j) {
-    uint32_t bits;
-    std::memcpy(&bits, &distance[j], 4);
-    keys[count++] = (uint64_t(bits) << 32) | uint32_t(j);
-  };
-  for (int j = 0; j < padded; j += LANES) {
-#if defined(__AVX512F__)
-    const __m512 d = _mm512_loadu_ps(distance + j);
-    unsigned near = _mm512_cmp_ps_mask(d, _mm512_set1_ps(bound), _CMP_LE_OQ) &
-                    _mm512_cmp_ps_mask(d, _mm512_set1_ps(FAR), _CMP_LT_OQ);
-    for (; near; near &= near - 1) keep(j + __builtin_ctz(near));
-#else
-    for (int lane = 0; lane < LANES; ++lane)
-      if (distance[j + lane] <= bound && distance[j + lane] < FAR) keep(j + lane);
-#endif
-  }
-  if (count > k) std::nth_element(keys.begin(), keys.begin() + k, keys.begin() + count);
-  else std::sort(keys.begin(), keys.begin() + count);
-  for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(keys[std::min(n, count - 1)]));
+  for (int j = 0; j < padded; ++j)
+    if (distance[j] <= bound && distance[j] < FAR) {
+      uint32_t bits;
+      std::memcpy(&bits, &distance[j], 4);
+      near.keys[count++] = (uint64_t(bits) << 32) | uint32_t(j);
+    }
+  const auto begin = near.keys.begin();
+  if (count > k) std::nth_element(begin, begin + k, begin + count);
+  else std::sort(begin, begin + count);
+  for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
 }
+
+#endif
 
 }  // namespace
 
@@ -95,7 +181,7 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
   const int padded = (count + 63) / 64 * 64;
   std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)QUERIES * padded);
   std::vector<float> queries((size_t)QUERIES * dims);
-  std::vector<uint64_t> keys(padded);
+  Candidates near(padded);
   for (int i = 0; i < count; ++i)
     for (int d = 0; d < dims; ++d) columns[(size_t)d * padded + i] = points[(size_t)i * dims + d];
   for (int first = 0; first < rows; first += QUERIES) {
@@ -106,7 +192,7 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
       float* row = &distance[(size_t)q * padded];
       std::fill(row + count, row + padded, FAR);
       row[first + q] = FAR;
-      select(row, padded, k, keys, out + (size_t)(first + q) * k);
+      select(row, padded, k, near, out + (size_t)(first + q) * k);
     }
   }
 }

@@ -60,16 +60,17 @@ class StraightPCF(nn.Module):
         rows: int | None = None,
         owned: torch.Tensor | None = None,
         full_evaluations: int = 1,
+        distance: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
 
         Returns the moved patches (B, P, 3), or their first `rows` points, for which the last evaluation costs
-        less, and their distances d (B, 1). With `owned`, (B,) at most `rows`, only so many points of each patch have
-        a velocity of every evaluation: the others, there as neighbours, keep that of the last of the first
-        full_evaluations. The flow is straight (section 4.2), so that hardly changes what is seen of them
-        (docs/training.md has the figures).
+        less, and their distances d (B, 1), those given or else the DistanceModule's. With `owned`, (B,) at most `rows`,
+        only so many points of each patch have a velocity of every evaluation: the others, there as neighbours, keep
+        that of the last of the first full_evaluations. The flow is straight (section 4.2), so that hardly changes
+        what is seen of them (docs/kernels.md has the figures).
         """
-        distance = self.distance_module(x)
+        distance = self.distance_module(x) if distance is None else distance
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
         evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
         moving = torch.zeros_like(x)
