@@ -2,14 +2,15 @@
 
 python -m benchmarks.calibrate --state runs/dm/state.safetensors --out
 
-Uses the held-out training shapes unless told otherwise, never the test split. Prints the table of d
-against known noise, and what `auto` would do against the best fixed number of passes.
+Uses the training shapes, never the test split. Prints the table of d against known noise, and what `auto`
+would do against the best fixed number of passes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,9 @@ import numpy.typing as npt
 
 from benchmarks.quality import SHARED
 from straightpcf.model.checkpoint import save_checkpoint
-from straightpcf.model.filter import DEFAULT_WEIGHTS
+from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.train.calibrate import NOISE_LEVELS, calibrate, passes
-from straightpcf.model.train.data import held_out_shapes
+from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, passes, trace
 from straightpcf.model.train.state import read_network
 
 
@@ -29,7 +29,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
-    parser.add_argument("--clouds", nargs="+", help="<shape>/<resolution>; by default all held-out shapes at 10000")
+    parser.add_argument(
+        "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
+    )
+    parser.add_argument("--traces", type=Path, help="keep what was measured here, and use what is there")
     parser.add_argument("--noise", type=float, nargs="+", default=NOISE_LEVELS)
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
@@ -37,7 +40,8 @@ def main() -> None:
 
     network, progress = read_network(arguments.state)
     clouds = _clouds(arguments.data, arguments.clouds)
-    calibration, traces = calibrate(network, clouds, noise_stds=arguments.noise, threads=arguments.threads)
+    traces = _traces(Filter(network, threads=arguments.threads), clouds, arguments.noise, arguments.traces)
+    calibration = calibrate(traces)
     columns = f"{'d before each pass':32} {'moved x1e3':24} {'CD x1e4 after 0, 1, ...':42}"
     print(f"{'cloud':18} {'noise':>7}  {columns} auto best")
     for t in traces:
@@ -61,13 +65,28 @@ def main() -> None:
 def _clouds(path: Path, wanted: list[str] | None) -> dict[str, npt.NDArray[np.float64]]:
     clouds = {}
     with np.load(path, allow_pickle=False) as archive:
-        held_out = held_out_shapes(archive.files)
-        for name in wanted or [f"{shape}/10000" for shape in sorted(held_out)]:
-            if name.split("/")[0] not in held_out:
-                print(f"{name} was trained on; held out are {', '.join(sorted(held_out))}")
+        shapes = sorted({key.split("/")[0] for key in archive.files})
+        every = [f"{shape}/10000" for shape in shapes] + [f"{shape}/50000" for shape in shapes[3::8]]
+        for name in wanted or every:
             xyz = archive[name].astype(np.float64)
             clouds[name] = CloudFrame.of(xyz).enter(xyz)
     return clouds
+
+
+def _traces(
+    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], noise: list[float], kept: Path | None
+) -> list[Trace]:
+    lines = kept.read_text().splitlines() if kept is not None and kept.is_file() else []
+    known = {(t.cloud, t.noise_std): t for t in (Trace(**json.loads(line)) for line in lines)}
+    for name, clean in clouds.items():
+        for std in noise:
+            if (name, std) in known:
+                continue
+            known[name, std] = measured = trace(filter_, name, clean, std)
+            if kept is not None:
+                with kept.open("a") as file:
+                    file.write(json.dumps(asdict(measured)) + "\n")
+    return list(known.values())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Calibration"]
+__all__ = ["Calibration", "signs"]
 
 
 @dataclass(frozen=True)
@@ -19,24 +19,22 @@ class Calibration:
     """The table and the limits that `auto` uses; measured by `model.train.calibrate`, kept with the weights.
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
-    Another pass is made while all of this holds: d was above `noisy` at the start; the last pass moved its points
-    by more than `settled` (median, in the frame the network sees); it left d above `still_noisy`, or brought it down
-    to less than `falls` of what it was; fewer than `most` were made. d after a pass cannot decide alone: on thin and
-    intricate shapes it stays high, and hardly falls, when the noise is gone.
+    rule: the weights of `signs` and a constant; another pass is made while their sum is above 0 and fewer than `most`
+    were made. d after a pass cannot decide alone: on thin and intricate shapes it stays high, and hardly falls,
+    when the noise is gone.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
-    noisy: float = 0.67
-    settled: float = 0.008
-    still_noisy: float = 0.6
-    falls: float = 0.75
+    rule: tuple[float, ...] = (0.7, -0.8, 0.6, 0.95, -0.05)
     most: int = 4
 
     def __post_init__(self) -> None:
         """Refuse tables that cannot be looked up in."""
         if len(self.distances) != len(self.noise) or len(self.noise) < 2 or np.any(np.diff(self.distances) <= 0):
             raise MalformedFile("the calibration's distances must rise and be as many as its noise levels, 2 at least")
+        if len(self.rule) != 5:
+            raise MalformedFile(f"the calibration's rule has {len(self.rule)} numbers; it must have 5")
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Calibration:
@@ -64,11 +62,17 @@ class Calibration:
         moves: the median displacement of each pass made; distances: d before each of them, and now.
         """
         done = len(moves)
-        if done >= self.most or (done > 0 and not self._noise_is_left(moves, distances)):
+        if done == 0:
+            return 2
+        if done >= self.most or float(np.dot(self.rule, [*signs(moves, distances), 1.0])) <= 0:
             return 0
         return 1 if done == self.most - 1 else 2
 
-    def _noise_is_left(self, moves: Sequence[float], distances: Sequence[float]) -> bool:
-        before, after = distances[len(moves) - 1 :][:2]
-        works = after > self.still_noisy or after < self.falls * before
-        return distances[0] > self.noisy and moves[-1] > self.settled and works
+
+def signs(moves: Sequence[float], distances: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return what tells whether noise is left after len(moves) passes, each about 0 at the limit.
+
+    d now; d now in terms of d before the last pass; how far that pass moved its points; d at the start.
+    """
+    before, now = distances[len(moves) - 1 :][:2]
+    return now - 0.6, now / max(before, 1e-6) - 0.8, 100 * moves[-1] - 0.8, distances[0] - 0.8

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import differential_evolution
 
-from straightpcf.model.calibration import Calibration
+from straightpcf.model.calibration import Calibration, signs
 from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
-from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "trace"]
+__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "passes", "trace"]
 
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
 _MOST_PASSES = 4
 # Between passes that serve a cloud equally well the rule takes fewer: a pass more costs time and detail.
 _PASS_PENALTY = 0.003
+_COPIES, _BLUR = 8, np.array([0.02, 0.02, 0.03, 0.02])  # noise put onto the signs, so that no cloud sits on the limit
 
 
 @dataclass(frozen=True)
@@ -44,22 +45,31 @@ def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std:
     return Trace(name, noise_std, tuple(run.distances), tuple(run.moves), chamfer)
 
 
-def calibrate(
-    network: StraightPCF,
-    clouds: Mapping[str, npt.NDArray[np.float64]],
-    *,
-    noise_stds: Sequence[float] = NOISE_LEVELS,
-    threads: int | None = None,
-) -> tuple[Calibration, list[Trace]]:
-    """Return the calibration for one network and the traces it was read off."""
-    filter_ = Filter(network, threads=threads)
-    traces = [trace(filter_, name, clean, std) for name, clean in clouds.items() for std in noise_stds]
-    table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in sorted(noise_stds)])
+def calibrate(traces: Sequence[Trace]) -> Calibration:
+    """Read the table of noise levels and the rule for another pass off recorded traces."""
+    levels = sorted({t.noise_std for t in traces})
+    table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in levels])
     base = Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table), most=_MOST_PASSES)
-    limits = [n / 4000 for n in range(8, 81)]  # 0.002 to 0.02
-    best = [_regret(replace(base, settled=limit), traces) for limit in limits]
-    ties = [limit for limit, regret in zip(limits, best, strict=True) if regret <= min(best) + 1e-9]
-    return replace(base, settled=ties[len(ties) // 2]), traces  # the middle of what serves equally well
+    return replace(base, rule=_fit(traces))
+
+
+def _fit(traces: Sequence[Trace]) -> tuple[float, ...]:
+    """Find the rule whose passes cost least: mean and spread of log(CD / best CD), also if the signs were a bit off."""
+    most = len(traces[0].moves)
+    seen = np.array([[signs(t.moves[:n], t.distances[: n + 1]) for n in range(1, most)] for t in traces])  # (T, n, 4)
+    regret = np.array([np.log(np.array(t.chamfer[1:]) / min(t.chamfer[1:])) for t in traces])
+    regret += _PASS_PENALTY * np.arange(most)
+    jitter = np.random.default_rng(0).normal(size=(_COPIES, *seen.shape)) * _BLUR
+    jitter[0] = 0.0
+
+    def cost(rule: npt.NDArray[np.float64]) -> float:
+        on = (seen + jitter) @ rule[:4] + rule[4] > 0  # (copies, T, n)
+        done = np.logical_and.accumulate(on, axis=2).sum(axis=2)
+        lost = np.take_along_axis(np.broadcast_to(regret, (_COPIES, *regret.shape)), done[..., None], axis=2)
+        return float(lost.mean() + 0.1 * np.sqrt((lost**2).mean()))
+
+    found = differential_evolution(cost, [(-1.0, 1.0)] * 5, rng=0, maxiter=300, popsize=20, tol=1e-10)
+    return tuple(round(float(weight), 4) for weight in found.x)
 
 
 def passes(calibration: Calibration, recorded: Trace) -> int:
@@ -68,16 +78,6 @@ def passes(calibration: Calibration, recorded: Trace) -> int:
     while calibration.passes_left(recorded.moves[:done], recorded.distances[: done + 1]):
         done += 1
     return done
-
-
-def _regret(calibration: Calibration, traces: Sequence[Trace]) -> float:
-    """Mean log of CD over the best CD, on the noisy clouds."""
-    total = 0.0
-    for t in traces:
-        done = passes(calibration, t)
-        if t.noise_std > 0:
-            total += float(np.log(t.chamfer[done] / min(t.chamfer[1:]))) + _PASS_PENALTY * done
-    return total
 
 
 def _rising(pairs: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
