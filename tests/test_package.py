@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 PUBLIC = {
     "straightpcf": ["__version__"],
-    "straightpcf.points.cloud": ["PointCloud"],
+    "straightpcf.points.cloud": ["NORMALS", "PointCloud"],
     "straightpcf.points.options": ["MAX_ITERATIONS", "DenoiseOptions"],
     "straightpcf.model.filter": [
         "DEFAULT_WEIGHTS",
