@@ -6,27 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Literal, get_args
+from typing import Any
 
 from straightpcf.points.errors import ERRORS_BY_CODE, InternalError, JobCanceled, JobExpired, StraightPCFError
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.jobs import FINISHED, STATES, JobState, ResultInfo
 
 __all__ = ["FINISHED", "STATES", "JobInfo", "JobState", "Report", "ResultInfo"]
-
-JobState = Literal["queued", "starting", "processing", "succeeded", "failed", "canceled", "expired"]
-STATES: tuple[JobState, ...] = get_args(JobState)
-FINISHED: frozenset[str] = frozenset({"succeeded", "failed", "canceled", "expired"})
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResultInfo:
-    """Describe a result file; sha256 in hex."""
-
-    bytes: int
-    sha256: str
-    media_type: str
-    filename: str
-    format: str
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,28 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from straightpcf.points.errors import StraightPCFError
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.jobs import FINISHED, STATES, JobState, ResultInfo
 
 __all__ = ["FINISHED", "STATES", "Claim", "EventKind", "JobEvent", "JobRecord", "JobState", "ResultInfo"]
 
-JobState = Literal["queued", "starting", "processing", "succeeded", "failed", "canceled", "expired"]
 EventKind = Literal["queued", "start", "progress", "preview", "output", "log", "completed"]
-STATES: tuple[JobState, ...] = get_args(JobState)
-FINISHED: frozenset[JobState] = frozenset({"succeeded", "failed", "canceled", "expired"})
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResultInfo:
-    """Describe a result file; sha256 in hex."""
-
-    bytes: int
-    sha256: str
-    media_type: str
-    filename: str
-    format: str
 
 
 @dataclass(frozen=True, kw_only=True)
