@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from safetensors import safe_open
 from torch import nn
 
 from benchmarks.conventional import jet_smooth
@@ -25,6 +26,7 @@ from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
+from straightpcf.model.train.state import read_network
 from straightpcf.points.options import DenoiseOptions
 
 Floats = npt.NDArray[np.float64]
@@ -105,29 +107,47 @@ def _runner(options: argparse.Namespace) -> Run:
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
         if not isinstance(module, VelocityModule):
             raise SystemExit("--model official takes the authors' single VelocityModule")
-        model = Filter(_alone(module), threads=options.threads, euler_steps=OFFICIAL_STEPS)
+        network = StraightPCF(couplings=1)
+        network.velocity_modules[0] = module
+        model = Filter(_without_distance(network), threads=options.threads, euler_steps=OFFICIAL_STEPS)
     else:
-        model = load_filter(options.weights, device=options.device, threads=options.threads)
+        model = _ours(options)
+    told = options.iterations == "told" or (options.iterations == "auto" and options.model == "official")
 
     def run(cloud: Floats, noise: float) -> tuple[Floats, int]:
-        passes = options.iterations
-        if passes == "auto" and options.model == "official":
-            passes = str(max(1, round(100 * noise)))  # it has no DistanceModule: the paper's rule, told the noise
+        passes = str(max(1, round(100 * noise))) if told else options.iterations
         result = model.denoise(cloud, DenoiseOptions.parse(iterations=passes, seed=str(options.seed)))
         return result.xyz, result.iterations
 
     return run
 
 
-def _alone(module: VelocityModule) -> StraightPCF:
-    """Put a lone VelocityModule into the whole network, the distance always 1."""
+def _ours(options: argparse.Namespace) -> Filter:
+    if options.weights and _is_training_state(options.weights):
+        model = Filter(read_network(options.weights)[0], device="cpu", threads=options.threads)
+    else:
+        model = load_filter(options.weights, device=options.device, threads=options.threads)
+    model.euler_steps = options.euler_steps or model.euler_steps
+    model.coverage = options.coverage or model.coverage
+    if options.every_evaluation:
+        model.full_evaluations = model.euler_steps * len(model.network.velocity_modules)
+    if options.without_distance:
+        _without_distance(model.network)
+    return model
+
+
+def _is_training_state(path: Path) -> bool:
+    with safe_open(path, framework="pt") as file:
+        return "progress" in (file.metadata() or {})
+
+
+def _without_distance(network: StraightPCF) -> StraightPCF:
+    """Make the distance always 1."""
 
     class One(nn.Module):
         def forward(self, x: torch.Tensor) -> torch.Tensor:
             return x.new_ones(len(x), 1)
 
-    network = StraightPCF(couplings=1)
-    network.velocity_modules[0] = module
     network.distance_module = One()  # type: ignore[assignment]
     return network
 
@@ -182,10 +202,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--resolution", type=int, nargs="+", default=[10000])
     parser.add_argument("--noise", type=float, nargs="+", default=[0.01, 0.02, 0.03], help="in unit-sphere radii")
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
-    parser.add_argument("--iterations", default="auto", help='"auto" or a number of passes')
+    parser.add_argument(
+        "--iterations",
+        default="auto",
+        help='"auto", a number of passes, or "told": 1, 2, 3 at 1, 2, 3 %%, as the paper',
+    )
+    parser.add_argument("--euler-steps", type=int, help="N of the paper, 3 by default")
+    parser.add_argument("--coverage", type=float, help="patches a point, 3 by default; the published scheme takes 6")
+    parser.add_argument("--every-evaluation", action="store_true", help="evaluate every point of a patch every time")
+    parser.add_argument("--without-distance", action="store_true", help="d = 1, as in the paper's ablation")
     parser.add_argument("--shapes", nargs="+", help="only these")
     parser.add_argument("--model", choices=("ours", "official", "jet", "noisy"), default="ours")
-    parser.add_argument("--weights", type=Path, help="the shipped ones, or the authors' with --model official")
+    parser.add_argument("--weights", type=Path, help="other weights, or the state of a training run")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--threads", type=int, help="CPU threads, all by default")
     parser.add_argument("--seed", type=int, default=0, help="of made noise and of the filter")

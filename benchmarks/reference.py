@@ -76,9 +76,8 @@ def velocity(state: State, x: torch.Tensor) -> torch.Tensor:
 
 
 def distance(state: State, x: torch.Tensor) -> torch.Tensor:
-    """Return a DistanceModule's (B, 1) distances of patches x (B, P, 3)."""
-    radius = x.norm(dim=2, keepdim=True).amax(dim=1, keepdim=True)
-    return torch.sigmoid(_decode(state, _encode(state, x / radius), pool=True))
+    """Return a DistanceModule's (B, 1) distances of patches x (B, P, 3), in our frame (docs/training.md)."""
+    return torch.sigmoid(_decode(state, _encode(state, 4 * x), pool=True))
 
 
 def euler(modules: list[State], x: torch.Tensor, *, steps: int, scale: torch.Tensor | float = 1.0) -> torch.Tensor:

@@ -146,7 +146,7 @@ def _rms(values: Floats) -> float:
 
 
 def _draw(name: str, before: PointCloud, after: PointCloud, folder: Path) -> None:
-    """Write a picture of a flat, crowded crop before and after, from above and along the surface."""
+    """Write a picture: a flat crop from above and from the side, a crop with structure, how far points moved."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -154,33 +154,54 @@ def _draw(name: str, before: PointCloud, after: PointCloud, folder: Path) -> Non
 
     finite = np.isfinite(before.xyz).all(axis=1)
     old, new = before.xyz[finite], after.xyz[finite]
-    crop, axes, centre = _flat_crop(old)
-    moved = np.linalg.norm(new[crop] - old[crop], axis=1)
-    views = [(xyz[crop] - centre) @ axes for xyz in (old, new)]  # columns: normal, across, along
-    slice_ = np.abs(views[0][:, 1]) < np.percentile(np.abs(views[0][:, 1]), 30)
-    figure, grid = pyplot.subplots(2, 2, figsize=(14, 9), sharex=True, sharey="row", constrained_layout=True)
-    style: dict[str, Any] = {"s": 4, "cmap": "viridis", "vmin": 0, "vmax": np.percentile(moved, 98)}
-    for column, (title, view) in enumerate(zip(("before", "after"), views, strict=True)):
-        grid[0, column].set_title(f"{name}, {title}: from above")
-        dots = grid[0, column].scatter(view[:, 2], view[:, 1], c=moved, **style)
-        grid[1, column].set_title("from the side, a slice, height stretched")
-        grid[1, column].scatter(view[slice_, 2], view[slice_, 0], c=moved[slice_], **style)
-    figure.colorbar(dots, ax=grid, label="moved by (the cloud's unit)")
+    moved = np.linalg.norm(new - old, axis=1)
+    style: dict[str, Any] = {"s": 3, "cmap": "viridis", "vmin": 0, "vmax": np.percentile(moved, 98)}
+    figure, axes = pyplot.subplot_mosaic(
+        [["flat 0", "flat 1"], ["side 0", "side 1"], ["edge 0", "edge 1"], ["moved", "moved"]],
+        figsize=(14, 17),
+        layout="constrained",
+    )
+    for row, flatness in (("flat", True), ("edge", False)):
+        crop, turn, centre = _crop(old, flat=flatness)
+        views = [(xyz[crop] - centre) @ turn for xyz in (old, new)]  # columns: normal, across, along
+        for column, view in enumerate(views):
+            said = ("before", "after")[column]
+            across = view[:, 1] if flatness else view[:, 0]
+            dots = axes[f"{row} {column}"].scatter(view[:, 2], across, c=moved[crop], **style)
+            axes[f"{row} {column}"].set_title(f"{name}, {said}: a {'flat' if flatness else 'structured'} place")
+            axes[f"{row} {column}"].set_aspect("equal")
+            if flatness:
+                slice_ = np.abs(views[0][:, 1]) < np.percentile(np.abs(views[0][:, 1]), 30)
+                axes[f"side {column}"].scatter(view[slice_, 2], view[slice_, 0], c=moved[crop][slice_], **style)
+                axes[f"side {column}"].set_title("the same from the side, a slice, height stretched")
+                axes["side 1"].set(xlim=axes["side 0"].get_xlim(), ylim=axes["side 0"].get_ylim())
+    spacing = float(np.median(cKDTree(old).query(old[:MEASURED_POINTS], k=2)[0][:, 1]))
+    bins = np.geomspace(max(moved.max(), 1e-12) * 1e-4, max(moved.max(), 1e-12), 80)
+    axes["moved"].hist(moved, bins=bins)
+    axes["moved"].axvline(spacing, color="k", linestyle=":")
+    axes["moved"].set(
+        xscale="log", xlabel="moved by (the cloud's unit); dotted: to the nearest neighbour", ylabel="points"
+    )
+    figure.colorbar(dots, ax=[axes[key] for key in axes if key != "moved"], label="moved by (the cloud's unit)")
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=110)
+    figure.savefig(folder / f"{name}.png", dpi=80)
     pyplot.close(figure)
     print(f"  picture: {folder / f'{name}.png'}")
 
 
-def _flat_crop(xyz: Floats) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
-    """Choose, of 200 neighbourhoods, the roundest of the flat ones: its rows, its axes (normal first), its centre."""
+def _crop(xyz: Floats, *, flat: bool) -> tuple[npt.NDArray[np.int64], Floats, Floats]:
+    """Choose one of 200 neighbourhoods: its rows, its axes (normal first), its centre.
+
+    flat: the roundest of the flat ones; otherwise the one that is widest in its two lesser directions.
+    """
     tree = cKDTree(xyz)
     best: tuple[float, Any] = (-np.inf, None)
     for seed in np.random.default_rng(0).integers(len(xyz), size=200):
         index = tree.query(xyz[seed], k=min(CROP_POINTS, len(xyz)))[1]
         centre = np.median(xyz[index], axis=0)
         spread, axes = np.linalg.eigh(np.cov((xyz[index] - centre).T))
-        score = spread[1] / max(spread[2], 1e-300) - 20 * max(0.0, spread[0] / max(spread[1], 1e-300) - 0.01)
+        round_, thick = spread[1] / max(spread[2], 1e-300), spread[0] / max(spread[1], 1e-300)
+        score = round_ - 20 * max(0.0, thick - 0.01) if flat else round_ * thick
         if score > best[0]:
             best = (score, (index, axes, centre))
     return best[1]  # type: ignore[no-any-return]

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,30 +27,40 @@ from benchmarks.shapes import Shape, analytic, make_noise, punet
 
 NOISE = 0.02
 SAMPLE = 16
+NEIGHBOURS = 32
+GEMM_ROWS = 32_000  # the edges of a patch
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What one side took: seconds, patches computed of those it has, peak resident MiB, and its result."""
+    """What one side took: seconds, patches computed of those it has, peak resident MiB, and its result.
+
+    gflop: in the matrix products of the patches that it has; neighbour searches are not counted.
+    """
 
     seconds: float
+    gflop: float
     patches: str
     peak_mib: float
     xyz: npt.NDArray[np.float64] | None
 
 
-Side = Callable[[npt.NDArray[np.float64], argparse.Namespace], Timing]
+_R = TypeVar("_R")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(arguments)
     print(f"{os.cpu_count()} CPUs, {options.threads} threads, {options.iterations} passes, noise {NOISE:g}")
+    rates = _alone(_gemm_rates, options)
+    said = ", ".join(f"{rate:.0f} in {kind}" for kind, rate in rates.items())
+    print(f"GEMM {GEMM_ROWS} x 256 x 256 here, GFLOP/s: {said}")
     for resolution in options.resolution:
         shape = _shape(options, resolution)
         noisy = shape.noisy.get(NOISE)
         noisy = make_noise("gaussian", shape.clean, NOISE, 0) if noisy is None else noisy
-        print(f"\n{shape.name}, {resolution} points {'seconds':>9s} {'peak MiB':>9s} {'CD':>8s} {'P2M':>8s}  patches")
+        columns = f"{'seconds':>9s} {'peak MiB':>9s} {'GFLOP':>8s} {'/s':>6s} {'CD':>8s} {'P2M':>8s}  patches"
+        print(f"\n{shape.name}, {resolution} points {columns}")
         _print("noisy input", None, noisy, shape)
         ours = _alone(_ours, noisy, options)
         _print("this project", ours, ours.xyz, shape)
@@ -65,9 +76,20 @@ def _ours(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing
     model = load_filter(options.weights, device="cpu", threads=options.threads)
     wanted = DenoiseOptions(iterations=options.iterations)
     model.denoise(noisy[:2000], wanted)  # what is compiled or loaded once is not the cloud's
+    done: list[tuple[int, int]] = []  # each patch's points, and how many of them were wanted
+    move = model.move
+
+    def counted(x: Any, owned: Any, distance: Any) -> Any:
+        done.extend((x.shape[1], int(rows)) for rows in owned)
+        return move(x, owned, distance)
+
+    model.move = counted  # type: ignore[method-assign]
     began = time.perf_counter()
     result = model.denoise(noisy, wanted)
-    return Timing(time.perf_counter() - began, f"all, {model.coverage:g}-fold", _peak(), result.xyz)
+    seconds = time.perf_counter() - began
+    evaluations = model.euler_steps * len(model.network.velocity_modules)
+    gflop = sum(_patch_gflop(points, rows, evaluations, model.full_evaluations) for points, rows in done)
+    return Timing(seconds, gflop, f"all, {model.coverage:g}-fold", _peak(), result.xyz)
 
 
 def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
@@ -85,14 +107,49 @@ def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> T
     result = reference.denoise(noisy, move, passes=options.iterations, batch=1, sample=options.patches)
     whole = result.timed_patches == result.patches
     extrapolated = "all" if whole else f"{result.timed_patches} of {result.patches}, EXTRAPOLATED"
-    return Timing(result.seconds, f"{extrapolated}, 6-fold", _peak(), result.xyz if whole else None)
+    points = reference.PATCH_SIZE
+    evaluations = 3 * architecture_of(state)["couplings"]
+    gflop = result.patches * _patch_gflop(points, points, evaluations, evaluations, per_edge=True)
+    return Timing(result.seconds, gflop, f"{extrapolated}, 6-fold", _peak(), result.xyz if whole else None)
 
 
-def _alone(side: Side, noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+def _patch_gflop(points: int, rows: int, evaluations: int, full: int, *, per_edge: bool = False) -> float:
+    """Count one patch: the DistanceModule, `full` evaluations for all points and the others for `rows` of them."""
+    velocities = [points if n < min(full, evaluations - 1) else rows for n in range(evaluations)]
+    return _net_gflop(128, points, points, per_edge) + sum(_net_gflop(256, points, r, per_edge) for r in velocities)
+
+
+def _net_gflop(width: int, points: int, rows: int, per_edge: bool) -> float:
+    """Count an encoder and its decoder, of which the last block computes `rows` points."""
+    flop = 0.0
+    for inside, out, made in ((3, width // 8, points), (width // 8, width // 4, points), (3 * width // 8, width, rows)):
+        first = 2 * inside * made * NEIGHBOURS if per_edge else inside * (points + made)
+        flop += 2 * (first * out + made * NEIGHBOURS * out**2 + made * inside * out)
+    return (flop + 2 * rows * (width**2 + 64 * width + 64 * 3)) / 1e9
+
+
+def _gemm_rates(options: argparse.Namespace) -> dict[str, float]:
+    import torch
+
+    torch.set_num_threads(options.threads)
+    rates = {}
+    for kind in (torch.float32, torch.bfloat16):
+        a, b = torch.randn(GEMM_ROWS, 256, dtype=kind), torch.randn(256, 256, dtype=kind)
+        out = torch.empty(GEMM_ROWS, 256, dtype=kind)
+        best = float("inf")
+        for _ in range(30):
+            began = time.perf_counter()
+            torch.mm(a, b, out=out)
+            best = min(best, time.perf_counter() - began)
+        rates[str(kind).removeprefix("torch.")] = 2 * GEMM_ROWS * 256**2 / best / 1e9
+    return rates
+
+
+def _alone(side: Callable[..., _R], *arguments: Any) -> _R:
     """Call one side in a fresh process."""
     context = multiprocessing.get_context("spawn")
     with context.Pool(1) as pool:
-        return pool.apply(side, (noisy, options))
+        return pool.apply(side, arguments)
 
 
 def _peak() -> float:
@@ -102,7 +159,10 @@ def _peak() -> float:
 def _print(name: str, timing: Timing | None, xyz: npt.NDArray[np.float64] | None, shape: Shape) -> None:
     from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
 
-    took = f"{timing.seconds:9.2f} {timing.peak_mib:9.0f}" if timing else " " * 19
+    took = " " * 35
+    if timing:
+        rate = timing.gflop / timing.seconds
+        took = f"{timing.seconds:9.2f} {timing.peak_mib:9.0f} {timing.gflop:8.0f} {rate:6.0f}"
     quality = f"{'-':>8s} {'-':>8s}"
     if xyz is not None:
         p2m = point_to_mesh_distance(xyz, shape.vertices, shape.faces)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Calibration", "signs"]
+__all__ = ["Calibration"]
 
 
 @dataclass(frozen=True)
@@ -19,22 +19,25 @@ class Calibration:
     """The table and the limits that `auto` uses; measured by `model.train.calibrate`, kept with the weights.
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
-    rule: the weights of `signs` and a constant; another pass is made while their sum is above 0 and fewer than `most`
-    were made. d after a pass cannot decide alone: on thin and intricate shapes it stays high, and hardly falls,
-    when the noise is gone.
+    starts: d at the start above which a cloud gets a second, a third, ... pass, as the paper gives 1, 2 and 3.
+    polished: (d at the start, d now): a cloud that was above the first and is below the second gets one pass more. On
+    thin and intricate shapes d stays higher when the noise is gone, and further passes pull their sides together.
+    stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
-    rule: tuple[float, ...] = (0.7, -0.8, 0.6, 0.95, -0.05)
+    starts: tuple[float, ...] = (0.76, 0.905)
+    polished: tuple[float, ...] = (0.45, 0.2)
+    stirred: float = 0.5
     most: int = 4
 
     def __post_init__(self) -> None:
         """Refuse tables that cannot be looked up in."""
         if len(self.distances) != len(self.noise) or len(self.noise) < 2 or np.any(np.diff(self.distances) <= 0):
             raise MalformedFile("the calibration's distances must rise and be as many as its noise levels, 2 at least")
-        if len(self.rule) != 5:
-            raise MalformedFile(f"the calibration's rule has {len(self.rule)} numbers; it must have 5")
+        if len(self.polished) != 2:
+            raise MalformedFile(f"the calibration's polished has {len(self.polished)} numbers; it must have 2")
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Calibration:
@@ -56,23 +59,14 @@ class Calibration:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
 
-    def passes_left(self, moves: Sequence[float], distances: Sequence[float]) -> int:
+    def passes_left(self, distances: Sequence[float]) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
-        moves: the median displacement of each pass made; distances: d before each of them, and now.
+        distances: d before each pass that was made, and now.
         """
-        done = len(moves)
-        if done == 0:
-            return 2
-        if done >= self.most or float(np.dot(self.rule, [*signs(moves, distances), 1.0])) <= 0:
+        done, start, now = len(distances) - 1, distances[0], distances[-1]
+        due = 1 + sum(start > limit for limit in self.starts)
+        polishing = done == due and start > self.polished[0] and now < self.polished[1]
+        if done >= self.most or not (done < due or polishing or now > self.stirred):
             return 0
-        return 1 if done == self.most - 1 else 2
-
-
-def signs(moves: Sequence[float], distances: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return what tells whether noise is left after len(moves) passes, each about 0 at the limit.
-
-    d now; d now in terms of d before the last pass; how far that pass moved its points; d at the start.
-    """
-    before, now = distances[len(moves) - 1 :][:2]
-    return now - 0.6, now / max(before, 1e-6) - 0.8, 100 * moves[-1] - 0.8, distances[0] - 0.8
+        return 1 if polishing or done == self.most - 1 else 2

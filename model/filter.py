@@ -20,9 +20,10 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.normalize import CloudFrame, patch_scales
-from straightpcf.model.patches import Patches, cut_patches
-from straightpcf.points.errors import DeviceUnavailable, TooFewPoints, TooLarge
+from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
+from straightpcf.model.patches import Patches
+from straightpcf.model.tiles import MIN_TILE_POINTS, Tiling, split
+from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints, TooLarge
 from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
@@ -32,6 +33,7 @@ MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patc
 EULER_STEPS = 3
 COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RESULTS.md compares)
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
+TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _PROBES = 48  # patches on which "auto" reads the noise
 _CUDA_BATCH = 32
 
@@ -73,17 +75,19 @@ class DenoiseResult:
     warnings: tuple[str, ...]
 
 
-def load_filter(weights: Path | None = None, *, device: str = "auto", threads: int | None = None) -> Filter:
+def load_filter(
+    weights: Path | None = None, *, device: str = "auto", threads: int | None = None, tile_points: int | None = None
+) -> Filter:
     """Load a network, the shipped one by default, onto "cpu", "cuda" or the better one present ("auto").
 
-    threads: CPU threads, all cores by default; the result does not depend on it. Raises DeviceUnavailable for
-    a device that is not here, MalformedFile for weights that do not fit.
+    threads: CPU threads, all cores by default; the result does not depend on it. tile_points: see Filter. Raises
+    DeviceUnavailable for a device that is not here, MalformedFile for weights that do not fit, InvalidOptions.
     """
     chosen = _device(device)
     path = DEFAULT_WEIGHTS if weights is None else weights
     network = load_checkpoint(path, device=chosen)
     calibration = Calibration.from_metadata(read_checkpoint(path)[1])
-    return Filter(network, calibration=calibration, device=chosen, threads=threads)
+    return Filter(network, calibration=calibration, device=chosen, threads=threads, tile_points=tile_points)
 
 
 def _device(name: str) -> str:
@@ -118,9 +122,18 @@ class Filter:
         threads: int | None = None,
         coverage: float = COVERAGE,
         euler_steps: int = EULER_STEPS,
-        full_evaluations: int | None = FULL_EVALUATIONS,
+        full_evaluations: int = FULL_EVALUATIONS,
         batch: int | None = None,
+        tile_points: int | None = None,
     ) -> None:
+        """Put a network between the stages.
+
+        tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
+        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
+        """
+        self.tile_points = TILE_POINTS if tile_points is None else tile_points
+        if self.tile_points < MIN_TILE_POINTS:
+            raise InvalidOptions(f"tile_points is {tile_points}; it must be at least {MIN_TILE_POINTS}")
         self.network = network.eval().requires_grad_(requires_grad=False)
         self.calibration = calibration or Calibration()
         self.device = device
@@ -132,11 +145,11 @@ class Filter:
         keep_large_buffers()
 
     def move(
-        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor | None = None
+        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor
     ) -> list[npt.NDArray[np.float64]]:
         """Return how far the first owned[i] points of each patch move: (B, P, 3) float32 -> B x (owned[i], 3).
 
-        distance: (B, 1), where the DistanceModule has been asked before.
+        distance: (B, 1), the d of the paper.
 
         A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
         is too many.
@@ -150,9 +163,9 @@ class Filter:
                     x[some],
                     euler_steps=self.euler_steps,
                     rows=rows,
-                    owned=torch.from_numpy(owned[some]).to(x.device) if self.full_evaluations is not None else None,
-                    full_evaluations=self.full_evaluations or 0,
-                    distance=None if distance is None else distance[some],
+                    owned=torch.from_numpy(owned[some]).to(x.device),
+                    full_evaluations=self.full_evaluations,
+                    distance=distance[some],
                 )
                 displacements = (moved - x[some, :rows]).double().cpu().numpy()
             except torch.OutOfMemoryError as exc:
@@ -201,33 +214,38 @@ class Run:
         if len(self.rows) < MIN_POINTS:
             untouched = len(xyz) - len(self.rows)
             raise TooFewPoints(f"{len(self.rows)} points to filter ({untouched} not finite); at least {MIN_POINTS}")
-        self.frame = CloudFrame.of(xyz[self.rows])
-        self.points = _Distinct(xyz[self.rows])
+        finite = xyz if len(self.rows) == len(xyz) else xyz[self.rows]
+        self.frame = CloudFrame.of(finite)
+        self.points = _Distinct(finite)
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.noise = [0.0, 0.0]
         self.distances: list[float] = []
-        self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes
+        self.scene = False
+        self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
         self.moves: list[float] = []  # the median displacement of each pass, in the frame the network sees
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
         if self.frame.radius == 0.0:
             return
-        start = self.frame.enter(self.points.xyz)
         planned = None if self.options.iterations == "auto" else self.options.iterations
+        tiles = split(self.points.xyz, self.filter.tile_points)
         with ThreadPoolExecutor(self.filter.threads, initializer=_one_thread) as pool:
             while True:
-                here = start + self.moved
-                cut = cut_patches(here, coverage=self.filter.coverage, seed=self.options.seed)
-                self.noise[1] = self._noise(here, cut, pool)
+                here = self.frame.enter(self.points.xyz)
+                here += self.moved
+                tiling = Tiling(
+                    here, tiles, coverage=self.filter.coverage, seed=self.options.seed, device=self.filter.device
+                )
+                self.noise[1] = self._noise(here, tiling, pool)
                 if self.iterations == 0:
                     self.noise[0] = self.noise[1]
                 left = self._passes_left(planned)
                 if left == 0:
                     return
                 self.iterations += 1
-                yield from self._pass(here, cut, pool, left)
+                yield from self._pass(here, tiling, pool, left)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -245,25 +263,28 @@ class Run:
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
-        return self.filter.calibration.passes_left(self.moves, self.distances)
+        return self.filter.calibration.passes_left(self.distances)
 
     def _pass(
-        self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor, left: int
+        self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor, left: int
     ) -> Iterator[FinishedPatch]:
-        scales = patch_scales(cut.radii)
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
         lengths = np.empty(len(here), dtype=np.float32)
+        settled = 0
         # The patches are cut from `here`, so results may be written into self.moved as they come.
-        for n, (patch, displacement) in enumerate(self._displacements(here, cut, scales, pool), start=1):
-            owned = cut.owned_points(patch)
-            lengths[owned] = np.linalg.norm(displacement, axis=1)
-            self.moved[owned] += displacement / scales[patch]
-            copies = self.points.copies(owned)
-            indices = self.rows[copies]
-            moved = self.moved[self.points.inverse[copies]]
-            xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
-            progress = (done_before + n / len(cut.seeds)) * share
-            yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
+        for cut in tiling.cuts():
+            scales = patch_scales(cut.radii, scene=self.scene)
+            for patch, displacement in self._displacements(here, cut, scales, pool):
+                owned = cut.owned_points(patch)
+                lengths[owned] = np.linalg.norm(displacement, axis=1)
+                self.moved[owned] += displacement / scales[patch]
+                settled += len(owned)
+                copies = self.points.copies(owned)
+                indices = self.rows[copies]
+                moved = self.moved[self.points.inverse[copies]]
+                xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
+                progress = (done_before + settled / len(here)) * share
+                yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
         self.moves.append(float(np.median(lengths)))
 
     def _displacements(
@@ -274,9 +295,12 @@ class Run:
 
         def move(first: int) -> list[npt.NDArray[np.float64]]:
             chosen = range(first, min(first + step, len(cut.seeds)))
-            known = [self.probed[i] for i in chosen if i in self.probed]
-            distance = torch.tensor(known, device=self.filter.device)[:, None] if len(known) == len(chosen) else None
-            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop], distance)
+            patches = self._tensor(here, cut, scales, chosen)
+            if all(i in self.probed for i in chosen):
+                distance = torch.tensor([[self.probed[i]] for i in chosen], device=patches.device)
+            else:
+                distance = self.filter.network.distance_module(patches)
+            return self.filter.move(patches, cut.owned[first : chosen.stop], distance)
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
@@ -289,20 +313,20 @@ class Run:
         local = [(here[cut.index[i]] - here[cut.seeds[i]]) * scales[i] for i in chosen]
         return torch.from_numpy(np.stack(local).astype(np.float32)).to(self.filter.device)  # (B, P, 3)
 
-    def _noise(self, here: npt.NDArray[np.float64], cut: Patches, pool: ThreadPoolExecutor) -> float:
+    def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor) -> float:
         """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame."""
-        count = len(cut.seeds)
-        probes = list(range(0, count, max(1, count // _PROBES)))
-        scales = patch_scales(cut.radii)
+        probes, numbers = tiling.probes(_PROBES)
+        self.scene = is_scene(probes.radii)
+        scales = patch_scales(probes.radii, scene=self.scene)
 
         def read(patch: int) -> float:
             with torch.inference_mode():
-                return float(self.filter.network.distance_module(self._tensor(here, cut, scales, [patch])))
+                return float(self.filter.network.distance_module(self._tensor(here, probes, scales, [patch])))
 
-        distances = np.array(list(pool.map(read, probes)))
-        self.probed = dict(zip(probes, distances.tolist(), strict=True))
+        distances = np.array(list(pool.map(read, range(len(probes.seeds)))))
+        self.probed = dict(zip(numbers, distances.tolist(), strict=False))
         self.distances.append(float(np.median(distances)))
-        return float(np.median(self.filter.calibration.noise_std(distances) / scales[probes]))
+        return float(np.median(self.filter.calibration.noise_std(distances) / scales))
 
 
 class _Distinct:
@@ -312,13 +336,15 @@ class _Distinct:
     """
 
     def __init__(self, xyz: npt.NDArray[np.float64]) -> None:
+        self.xyz, self.inverse, self.repeated = xyz, np.arange(len(xyz)), False
+        if not _may_repeat(xyz):
+            return
         unique, inverse = np.unique(xyz, axis=0, return_inverse=True)
-        self.repeated = len(unique) < len(xyz)
-        self.xyz = unique if self.repeated else xyz
-        self.inverse = inverse.reshape(-1) if self.repeated else np.arange(len(xyz))
-        if self.repeated:
-            self._order = np.argsort(self.inverse, kind="stable")
-            self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(unique) + 1))
+        if len(unique) == len(xyz):
+            return
+        self.xyz, self.inverse, self.repeated = unique, inverse.reshape(-1), True
+        self._order = np.argsort(self.inverse, kind="stable")
+        self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(unique) + 1))
 
     def copies(self, distinct: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the points that lie at some distinct rows."""
@@ -326,6 +352,16 @@ class _Distinct:
             return distinct.astype(np.int64)
         groups = [self._order[self._starts[d] : self._starts[d + 1]] for d in distinct]
         return np.concatenate(groups) if groups else distinct.astype(np.int64)
+
+
+def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
+    """Say whether any two rows may be equal: by hashes, for sorting whole rows takes ten times a row's memory."""
+    hashed = np.zeros(len(xyz), dtype=np.uint64)
+    for axis in range(3):
+        hashed *= np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits
+        hashed ^= (xyz[:, axis] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
+    hashed.sort()
+    return bool((hashed[1:] == hashed[:-1]).any())
 
 
 def _one_thread() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CloudFrame", "patch_scales"]
+__all__ = ["CloudFrame", "is_scene", "patch_scales"]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st and 99th percentile of
 # punet_train.npz at 10K to 50K points (docs/training.md says how they were measured).
@@ -15,6 +15,7 @@ _SMALLEST_RADIUS, _LARGEST_RADIUS = 0.13, 0.58
 _USUAL_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
+_BLOCK = 2**16  # rows whose distances are held at once
 
 
 @dataclass(frozen=True)
@@ -29,24 +30,33 @@ class CloudFrame:
         """Measure finite points (N, 3); the radius is 0 where they all coincide."""
         low, high = xyz.min(axis=0), xyz.max(axis=0)
         centre = low / 2 + high / 2  # halves first: the sum may overflow
-        extent = float(np.abs(xyz - centre).max())
+        extent = float(max((high - centre).max(), (centre - low).max()))
         if extent == 0.0:
             return cls(centre, 0.0)
-        return cls(centre, extent * float(np.linalg.norm((xyz - centre) / extent, axis=1).max()))
+        blocks = (xyz[start : start + _BLOCK] for start in range(0, len(xyz), _BLOCK))
+        return cls(centre, extent * max(float(np.linalg.norm((b - centre) / extent, axis=1).max()) for b in blocks))
 
     def enter(self, xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return (N, 3) float64 positions in the unit ball."""
-        return (xyz - self.centre) / self.radius
+        out = xyz - self.centre
+        out /= self.radius
+        return out
 
 
-def patch_scales(radii: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def is_scene(radii: npt.NDArray[np.float64]) -> bool:
+    """Say of a cloud, by the radii of some of its patches in the unit ball, whether it is no object seen whole.
+
+    A street or a LiDAR frame has patches far smaller beside its bounding sphere than any in training.
+    """
+    return float(np.median(radii)) < _SCENE_RADIUS
+
+
+def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool) -> npt.NDArray[np.float64]:
     """Return the factor that brings each patch of the unit-ball cloud to a size the network knows, (M,) float64.
 
-    Patches of an object sampled like the training clouds keep their size: then this is the paper's frame.
-    A street or a LiDAR frame has patches far smaller beside its bounding sphere: where most are far smaller than any
-    in training, each is brought to the usual size, or keeps a larger one (docs/training.md says why not to the nearest
-    that was seen). Patches larger than any in training are shrunk to the largest. One of radius 0 keeps the factor 1.
+    Patches of an object sampled like the training clouds keep their size: then this is the paper's frame. Those of a
+    scene are brought to the usual size, or keep a larger one (docs/training.md says why not to the nearest that was
+    seen). Patches larger than any in training are shrunk to the largest. One of radius 0 keeps the factor 1.
     """
-    is_scene = float(np.median(radii)) < _SCENE_RADIUS
-    wanted = np.clip(radii, _USUAL_RADIUS if is_scene else _SMALLEST_RADIUS, _LARGEST_RADIUS)
+    wanted = np.clip(radii, _USUAL_RADIUS if scene else _SMALLEST_RADIUS, _LARGEST_RADIUS)
     return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

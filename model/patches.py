@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-__all__ = ["PATCH_SIZE", "Patches", "cut_patches"]
+__all__ = ["PATCH_SIZE", "Patches", "cut_patches", "patches_around"]
 
 PATCH_SIZE = 1000
 _TREE_HEIGHT = 7  # of the sampler's buckets; their number may not pass the number of points
@@ -20,19 +20,38 @@ class Patches:
     """M patches of P points of one cloud.
 
     seeds: (M,) int64 rows; index: (M, P) int32 rows, the points that the patch owns first, then the others, each
-    part nearest to the seed first; owned: (M,) int64, how many it owns; radii: (M,) float64 distance to the
-    farthest; owner: (N,) int32, the patch that has the last word on each point.
+    part nearest to the seed first; owned: (M,) int64, how many it owns: on these the patch has the last word;
+    radii: (M,) float64 distance to the farthest.
     """
 
     seeds: npt.NDArray[np.int64]
     index: npt.NDArray[np.int32]
     owned: npt.NDArray[np.int64]
     radii: npt.NDArray[np.float64]
-    owner: npt.NDArray[np.int32]
 
     def owned_points(self, patch: int) -> npt.NDArray[np.int32]:
         """Return the rows of the cloud that a patch owns."""
         return self.index[patch, : self.owned[patch]]
+
+    def every(self, step: int) -> Patches:
+        """Return each step-th patch."""
+        return Patches(self.seeds[::step], self.index[::step], self.owned[::step], self.radii[::step])
+
+    def of_rows(self, rows: npt.NDArray[np.int64]) -> Patches:
+        """Return the same patches for a cloud of which this one is xyz[rows]."""
+        return Patches(rows[self.seeds], rows[self.index].astype(np.int32), self.owned, self.radii)
+
+    def owning_below(self, count: int) -> Patches:
+        """Return the patches that own any of the first `count` rows, owning nothing else."""
+        owns = (np.arange(self.index.shape[1]) < self.owned[:, None]) & (self.index < count)
+        some = owns.any(axis=1)
+        return Patches(self.seeds[some], _first(self.index[some], owns[some]), owns[some].sum(axis=1), self.radii[some])
+
+    @classmethod
+    def joined(cls, parts: list[Patches]) -> Patches:
+        """Return the patches of several cuts of one cloud, all of one size."""
+        fields = zip(*((part.seeds, part.index, part.owned, part.radii) for part in parts), strict=True)
+        return cls(*(np.concatenate(field) for field in fields))
 
 
 def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE) -> Patches:
@@ -63,8 +82,19 @@ def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, pat
         distance, index = np.concatenate([distance, more_distance]), np.concatenate([index, more_index])
     owner = _owners(distance, index, count)
     owns = owner[index] == np.arange(len(seeds), dtype=np.int32)[:, None]
-    index = np.take_along_axis(index, np.argsort(~owns, axis=1, kind="stable"), axis=1)
-    return Patches(seeds, index, owns.sum(axis=1), distance[:, -1].astype(np.float64), owner)
+    return Patches(seeds, _first(index, owns), owns.sum(axis=1), distance[:, -1].astype(np.float64))
+
+
+def patches_around(tree: cKDTree, seeds: npt.NDArray[np.float64], patch_size: int) -> Patches:
+    """Return the `patch_size` nearest points of a tree to each of (M, 3) seeds, as patches that own nothing."""
+    distance, index = _nearest(tree, seeds, patch_size)
+    radii = distance[:, -1].astype(np.float64)
+    return Patches(index[:, 0].astype(np.int64), index, np.zeros(len(seeds), dtype=np.int64), radii)
+
+
+def _first(index: npt.NDArray[np.int32], chosen: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    """Return each row of index (M, P) with the chosen entries before the others, both in their order."""
+    return np.take_along_axis(index, np.argsort(~chosen, axis=1, kind="stable"), axis=1)
 
 
 def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDArray[np.int64]:

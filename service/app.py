@@ -194,7 +194,12 @@ def _limits(settings: Settings) -> Limits:
 def _local_backend(settings: Settings) -> LocalBackend:
     return LocalBackend(
         [
-            WorkerSpec(device=device.strip(), weights=settings.weights, threads=settings.threads)
+            WorkerSpec(
+                device=device.strip(),
+                weights=settings.weights,
+                threads=settings.threads,
+                tile_points=settings.tile_points,
+            )
             for device in settings.device.split(",")
         ]
     )

@@ -16,7 +16,7 @@ ENVIRONMENT_PREFIX = "STRAIGHTPCF_"
 _OF_CLIENTS = frozenset({"STRAIGHTPCF_URL", "STRAIGHTPCF_KEY"})  # what the CLI's other commands read
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
-    "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
+    "max_sync_seconds", "result_ttl_seconds", "threads", "tile_points", "shutdown_seconds",
 )  # fmt: skip
 
 
@@ -39,6 +39,7 @@ class Settings:
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
     weights: None for the shipped ones.  threads: None for torch's own choice.
+    tile_points: of a cloud, cut into patches at once; None for the filter's own default.
     shutdown_seconds: how long running requests may finish after SIGTERM.
     """
 
@@ -63,6 +64,7 @@ class Settings:
     device: str = "auto"
     weights: Path | None = None
     threads: int | None = None
+    tile_points: int | None = None
     shutdown_seconds: int = 30
 
     def __post_init__(self) -> None:

@@ -10,6 +10,9 @@ from straightpcf.model.nets.edgeconv import Decoder, Encoder
 __all__ = ["DistanceModule", "StraightPCF", "VelocityModule"]
 
 
+_PATCHES_PER_RADIUS = 4.0  # the median patch of training has a quarter of its object's radius
+
+
 class VelocityModule(nn.Module):
     """v(X): the constant velocity that carries a noisy patch to the surface in unit time (section 4.1)."""
 
@@ -31,7 +34,12 @@ class VelocityModule(nn.Module):
 
 
 class DistanceModule(nn.Module):
-    """d(X) in (0, 1): how far from the surface a patch is, in units of the training noise (section 4.3)."""
+    """d(X) in (0, 1): how far from the surface a patch is, in units of the training noise (section 4.3).
+
+    The published one sees each patch scaled to unit radius, where the noise is known only relative to the patch and
+    patches differ fourfold in radius. This one sees the VelocityModule's frame: the training noise has one size there
+    (docs/training.md has the figures of both).
+    """
 
     def __init__(self, width: int = 128) -> None:
         super().__init__()
@@ -40,8 +48,7 @@ class DistanceModule(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return (B, 1) distances of patches x (B, P, 3), centred on their seeds."""
-        radius = x.norm(dim=2).amax(dim=1).clamp_min(1e-12)  # (B,)
-        return torch.sigmoid(self.decoder(self.encoder(x / radius[:, None, None])))
+        return torch.sigmoid(self.decoder(self.encoder(x * _PATCHES_PER_RADIUS)))
 
 
 class StraightPCF(nn.Module):

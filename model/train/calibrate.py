@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import differential_evolution
 
-from straightpcf.model.calibration import Calibration, signs
+from straightpcf.model.calibration import Calibration
 from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.points.options import DenoiseOptions
@@ -18,9 +17,6 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "passes", "trace"]
 
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
 _MOST_PASSES = 4
-# Between passes that serve a cloud equally well the rule takes fewer: a pass more costs time and detail.
-_PASS_PENALTY = 0.003
-_COPIES, _BLUR = 8, np.array([0.02, 0.02, 0.03, 0.02])  # noise put onto the signs, so that no cloud sits on the limit
 
 
 @dataclass(frozen=True)
@@ -46,36 +42,16 @@ def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std:
 
 
 def calibrate(traces: Sequence[Trace]) -> Calibration:
-    """Read the table of noise levels and the rule for another pass off recorded traces."""
+    """Read the table of noise levels off recorded traces."""
     levels = sorted({t.noise_std for t in traces})
     table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in levels])
-    base = Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table), most=_MOST_PASSES)
-    return replace(base, rule=_fit(traces))
-
-
-def _fit(traces: Sequence[Trace]) -> tuple[float, ...]:
-    """Find the rule whose passes cost least: mean and spread of log(CD / best CD), also if the signs were a bit off."""
-    most = len(traces[0].moves)
-    seen = np.array([[signs(t.moves[:n], t.distances[: n + 1]) for n in range(1, most)] for t in traces])  # (T, n, 4)
-    regret = np.array([np.log(np.array(t.chamfer[1:]) / min(t.chamfer[1:])) for t in traces])
-    regret += _PASS_PENALTY * np.arange(most)
-    jitter = np.random.default_rng(0).normal(size=(_COPIES, *seen.shape)) * _BLUR
-    jitter[0] = 0.0
-
-    def cost(rule: npt.NDArray[np.float64]) -> float:
-        on = (seen + jitter) @ rule[:4] + rule[4] > 0  # (copies, T, n)
-        done = np.logical_and.accumulate(on, axis=2).sum(axis=2)
-        lost = np.take_along_axis(np.broadcast_to(regret, (_COPIES, *regret.shape)), done[..., None], axis=2)
-        return float(lost.mean() + 0.1 * np.sqrt((lost**2).mean()))
-
-    found = differential_evolution(cost, [(-1.0, 1.0)] * 5, rng=0, maxiter=300, popsize=20, tol=1e-10)
-    return tuple(round(float(weight), 4) for weight in found.x)
+    return Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
 
 
 def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
-    while calibration.passes_left(recorded.moves[:done], recorded.distances[: done + 1]):
+    while calibration.passes_left(recorded.distances[: done + 1]):
         done += 1
     return done
 

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import torch
 
-from straightpcf.model.train.data import CANDIDATES, NOISE_STD, PATCH_SIZE, SCALES, Batch, PatchSource
+from straightpcf.model.train.data import (
+    CANDIDATES,
+    NEAR_SHARE,
+    NEAR_WEIGHT,
+    NOISE_STD,
+    PATCH_SIZE,
+    SCALES,
+    Batch,
+    PatchSource,
+)
 
 __all__ = ["DevicePatchSource", "random_rotations"]
 
@@ -18,6 +27,7 @@ class DevicePatchSource:
 
     def __init__(self, source: PatchSource, device: torch.device) -> None:
         self._counts = torch.tensor([len(cloud) for cloud in source.clouds], device=device)
+        self._candidates = min([CANDIDATES, *map(len, source.clouds)])
         shape = (len(source.clouds), int(self._counts.max()), 3)
         self._clouds = torch.full(shape, torch.inf, dtype=torch.float32, device=device)
         for padded, cloud in zip(self._clouds, source.clouds, strict=True):
@@ -30,14 +40,17 @@ class DevicePatchSource:
         seeds = (torch.rand(batch_size, device=device) * self._counts[which]).long()
         clouds = self._clouds[which]  # (B, N, 3)
         squared = (clouds - clouds.gather(1, _rows(seeds[:, None]))).square().sum(dim=2)
-        near = squared.topk(CANDIDATES, dim=1, largest=False).indices  # (B, C), the seed first
+        near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
         clean = clouds.gather(1, _rows(near))
         noisy = clean + NOISE_STD * torch.randn_like(clean)
-        squared = (noisy - noisy[:, :1]).square().sum(dim=2)
-        inside = squared.topk(PATCH_SIZE, dim=1, largest=False).indices
-        inside = inside.gather(1, torch.rand_like(squared[:, :PATCH_SIZE]).argsort(dim=1))
         time = torch.rand(batch_size, 1, 1, device=device)
-        origin = torch.lerp(noisy[:, :1], clean[:, :1], time)
+        here = torch.lerp(noisy, clean, time)
+        origin = here[:, :1]
+        squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does
+        inside = squared.topk(PATCH_SIZE, dim=1, largest=False).indices
+        turn = torch.empty(batch_size, PATCH_SIZE, device=device).exponential_()
+        turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
+        inside = inside.gather(1, turn.argsort(dim=1))
         scale = torch.empty(batch_size, 1, 1, device=device).uniform_(*SCALES)
         transform = random_rotations(batch_size, device) * scale
         return Batch(

@@ -23,6 +23,8 @@ __all__ = ["WorkerProcess"]
 
 # A worker that reads or writes a large file does not look at its pipe; after this it is replaced.
 CANCEL_PATIENCE_SECONDS = 0.8
+# A process closes its pipe a moment before it can be reaped; the loop may be held up for so long.
+REAP_SECONDS = 0.01
 
 _SPAWN = multiprocessing.get_context("spawn")  # a forked CUDA context is broken, and a fork copies our sockets
 
@@ -98,6 +100,7 @@ class WorkerProcess:
             while self.alive and self._pipe.poll():
                 self._take(self._pipe.recv())
         except (EOFError, OSError):
+            self._process.join(REAP_SECONDS)
             self._bury()
 
     def _take(self, message: Any) -> None:
@@ -123,9 +126,17 @@ class WorkerProcess:
             return
         self._loop.remove_reader(self._pipe.fileno())
         self._pipe.close()
-        self._process.kill()  # its end of the pipe may be gone while it is not
+        how = self._end()
         self.died.set_result(None)
         if not self.ready.done():
-            self.ready.set_exception(WorkerDied(f"worker {self.pid} ended before it was ready"))
+            self.ready.set_exception(WorkerDied(f"worker {self.pid} {how} before it was ready"))
         if self._answer is not None and not self._answer.done():
-            self._answer.set_exception(WorkerDied(f"worker {self.pid} ended during job {self._job and self._job.id}"))
+            self._answer.set_exception(WorkerDied(f"worker {self.pid} {how} during job {self._job and self._job.id}"))
+
+    def _end(self) -> str:
+        """Make sure that the process ends, its end of the pipe being gone or unwanted; say how it ended by itself."""
+        code = self._process.exitcode
+        self._process.kill()
+        if code is None:
+            return "was ended"
+        return f"ended with exit code {code}" if code >= 0 else f"was killed by signal {-code}"

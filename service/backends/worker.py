@@ -33,6 +33,7 @@ class WorkerSpec:
     device: str
     weights: Path | None
     threads: int | None
+    tile_points: int | None = None
 
 
 # What crosses the pipe. To the worker: FileJob, Cancel, None to end. From it: the others.
@@ -111,7 +112,7 @@ def _load(spec: WorkerSpec) -> Filter:
 
     from straightpcf.model.filter import load_filter
 
-    denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads)
+    denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads, tile_points=spec.tile_points)
     directions = np.random.default_rng(0).normal(size=(WARM_UP_POINTS, 3))
     denoiser.denoise(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     return denoiser

@@ -69,10 +69,11 @@ def test_a_patch_does_not_see_its_batch() -> None:
     torch.testing.assert_close(both[1:, :25], alone)
 
 
-def test_the_distance_lies_between_0_and_1_and_does_not_see_the_scale() -> None:
+def test_the_distance_lies_between_0_and_1_and_belongs_to_the_whole_patch() -> None:
     torch.manual_seed(0)
-    module, x = DistanceModule().eval(), torch.randn(2, 300, 3)
+    module, x = DistanceModule().eval(), 0.1 * torch.randn(2, 300, 3)
     with torch.inference_mode():
-        small, large = module(x * 1e-3), module(x * 1e3)
-    assert ((small > 0) & (small < 1)).all()
-    torch.testing.assert_close(small, large, atol=1e-3, rtol=1e-3)
+        distance, mixed = module(x), module(x[:, torch.randperm(300)])
+    assert distance.shape == (2, 1)
+    assert ((distance > 0) & (distance < 1)).all()
+    torch.testing.assert_close(mixed, distance, atol=1e-3, rtol=1e-3)

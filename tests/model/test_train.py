@@ -66,6 +66,31 @@ def test_patches_drawn_on_the_device_are_like_those_drawn_on_the_host(data: Path
     assert 0.8 < radii[0] / radii[1] < 1.25
 
 
+@pytest.mark.parametrize("on_device", [False, True])
+def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
+    # A patch of a plane cut at x_t is a disc: 0.81 of its points lie within 0.9 of its radius, however late t is.
+    plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
+    source = PatchSource([plane])
+    torch.manual_seed(0)
+    device = torch.device("cpu")
+    batch = DevicePatchSource(source, device).draw(64) if on_device else source.draw(np.random.default_rng(0), 64)
+    reach = batch.at(batch.time).norm(dim=2)
+    within = (reach < 0.9 * reach.amax(dim=1, keepdim=True)).float().mean(dim=1)
+    late = batch.time.flatten() > 0.7
+    assert within[late].mean() == pytest.approx(0.81, abs=0.02)
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_most_points_of_the_loss_are_near_the_seed(data: Path, *, on_device: bool) -> None:
+    source = PatchSource.read(data)
+    torch.manual_seed(0)
+    device = torch.device("cpu")
+    batch = DevicePatchSource(source, device).draw(16) if on_device else source.draw(np.random.default_rng(0), 16)
+    rank = batch.at(batch.time).norm(dim=2).argsort(dim=1).argsort(dim=1)
+    assert (rank[:, :256] < PATCH_SIZE // 2).float().mean() == pytest.approx(0.88, abs=0.03)
+    assert (rank[:, :256] >= PATCH_SIZE // 2).any()
+
+
 def test_random_rotations_are_rotations() -> None:
     turn = random_rotations(50, torch.device("cpu"))
     torch.testing.assert_close(turn @ turn.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0)

@@ -6,7 +6,6 @@ import io
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -31,6 +30,7 @@ from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub  # n
 from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE  # noqa: E402
 from tests.clouds import noisy, sphere, torus  # noqa: E402
 from tests.conftest import RunningServer, run_server  # noqa: E402
+from tests.waiting import wait_for  # noqa: E402
 
 POINTS = 400
 
@@ -93,7 +93,7 @@ def test_denoise_streams_patches_the_file_and_a_summary(server: RunningServer, s
     assert (summary.state, summary.report.points, summary.result.bytes) == (pb.JOB_STATE_SUCCEEDED, POINTS, len(file))
     rest = httpx2.post(f"{server.url}/denoise?iterations=1&filename=cloud.npy", content=SMALL, timeout=60)
     assert rest.content == file
-    _wait_for(lambda: not server.spooled_files())
+    wait_for(lambda: not server.spooled_files())
 
 
 def test_denoise_without_patches_tells_progress(stub: Any) -> None:
@@ -177,14 +177,14 @@ def test_a_call_that_ends_early_frees_the_worker_and_leaves_nothing(
             if ending == "cancel" and answer.WhichOneof("part") == "patch":
                 call.cancel()
     assert call.code().name == {"cancel": "CANCELLED", "deadline": "DEADLINE_EXCEEDED"}[ending]
-    _wait_for(lambda: not httpx2.get(f"{server.url}/jobs").json()["jobs"] and not server.spooled_files())
+    wait_for(lambda: not httpx2.get(f"{server.url}/jobs").json()["jobs"] and not server.spooled_files())
 
 
 def test_health_and_reflection_answer(channel: Any) -> None:
     check = health_pb2_grpc.HealthStub(channel).Check
     for service in ("", "straightpcf.v1.DenoiseService"):
         request = health_pb2.HealthCheckRequest(service=service)
-        _wait_for(lambda: check(request).status == health_pb2.HealthCheckResponse.SERVING)  # noqa: B023
+        wait_for(lambda: check(request).status == health_pb2.HealthCheckResponse.SERVING)  # noqa: B023
     ask = reflection_pb2.ServerReflectionRequest
     questions = iter([ask(list_services=""), ask(file_containing_symbol="straightpcf.v1.DenoiseService")])
     names, file = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(questions)
@@ -254,10 +254,3 @@ def test_sigterm_lets_a_call_finish(tmp_path: Path) -> None:
         server.process.send_signal(signal.SIGTERM)
         assert list(answers)[-1].summary.state == pb.JOB_STATE_SUCCEEDED
         server.process.wait(timeout=20)
-
-
-def _wait_for(look: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 5
-    while not look():
-        assert time.monotonic() < deadline, "the job outlives its call"
-        time.sleep(0.05)

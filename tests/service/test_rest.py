@@ -22,6 +22,7 @@ from straightpcf.points.errors import ERRORS_BY_CODE
 from straightpcf.service.api.errors import STATUS_BY_CODE
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
+from tests.waiting import wait_for
 
 POINTS = 400
 
@@ -323,7 +324,7 @@ def test_the_worker_that_is_killed_is_replaced_and_the_request_still_answered(
         target=lambda: answers.append(curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise"))
     )
     thread.start()
-    _wait_for(lambda: bool(server.spooled_files()))
+    wait_for(lambda: bool(server.spooled_files()))
     time.sleep(0.3)
     os.kill(worker, signal.SIGKILL)
     thread.join()
@@ -340,7 +341,7 @@ def test_a_client_that_goes_away_frees_the_worker_and_leaves_no_file(
     began = time.monotonic()
     assert curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise").status == 200
     assert time.monotonic() - began < 15, "the canceled job was computed to its end"
-    _wait_for(lambda: not server.spooled_files())
+    wait_for(lambda: not server.spooled_files())
 
 
 def test_health_answers_fast_while_a_job_runs(server: RunningServer, large_cloud: Path) -> None:
@@ -349,7 +350,7 @@ def test_health_answers_fast_while_a_job_runs(server: RunningServer, large_cloud
         stdout=subprocess.DEVNULL,
     )
     try:
-        _wait_for(lambda: bool(server.spooled_files()))
+        wait_for(lambda: bool(server.spooled_files()))
         with httpx2.Client(base_url=server.url) as client:
             seconds = []
             for _ in range(40):
@@ -385,13 +386,6 @@ def test_info_says_what_the_server_takes(strict_server: RunningServer) -> None:
     assert (info["max_bytes"], info["max_points"], info["max_jobs"]) == (100_000, 4_000, 1)
     assert info["devices"] == ["cpu"]
     assert "ply" in {entry["name"] for entry in info["formats"]}
-
-
-def _wait_for(condition: Any, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "not within the time"
-        time.sleep(0.02)
 
 
 def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer) -> None:

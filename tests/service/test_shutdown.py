@@ -8,13 +8,13 @@ import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tests.clouds import noisy, torus
 from tests.conftest import run_server
+from tests.waiting import wait_for
 
 
 def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         # The request comes before the worker is warm: it waits for it.
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=1"]
         request = subprocess.Popen(command, stdout=subprocess.PIPE)
-        _wait_for(server.spooled_files)
+        wait_for(server.spooled_files)
         worker = server.worker_pid()
         server.process.send_signal(signal.SIGTERM)
         body, _ = request.communicate(timeout=60)
@@ -41,7 +41,7 @@ def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(t
         worker = server.worker_pid()
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=3"]
         request = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        _wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
+        wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
         server.process.kill()
         assert request.wait(timeout=20) != 0
         deadline = time.monotonic() + 20
@@ -54,13 +54,6 @@ def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(t
         assert job["state"] in ("queued", "starting", "processing")
         subprocess.run(["curl", "-s", "-X", "DELETE", f"{server.url}/jobs/{job['id']}"], check=True)
         assert not server.spooled_files()
-
-
-def _wait_for(look: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
-    while not look():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def _runs(pid: int) -> bool:

@@ -1,0 +1,108 @@
+"""Large clouds are cut tile by tile, so that what cutting needs of memory depends on a tile, not on the cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial import cKDTree
+
+from straightpcf.model.device_patches import cut_patches_on
+from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches, patches_around
+
+__all__ = ["MIN_TILE_POINTS", "Tiling", "split"]
+
+MIN_TILE_POINTS = 10 * PATCH_SIZE  # half of it, the smallest tile, still has whole patches
+# A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
+_HALO_RADII = 2.0
+_SPARSEST = 90  # percentile of a tile's patch radii that its halo is made for
+
+
+def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np.int64]]:
+    """Part (N, 3) points into tiles of at most `tile_points` rows, halving along the longest side; rows ascend.
+
+    Neighbouring tiles follow one another, and every row is in one of them.
+    """
+    tiles: list[npt.NDArray[np.int64]] = []
+    left = [np.arange(len(xyz))]
+    while left:
+        rows = left.pop()
+        if len(rows) <= tile_points:
+            tiles.append(np.sort(rows))
+            continue
+        axis = int(np.argmax(np.ptp(xyz[rows], axis=0)))
+        middle = len(rows) // 2
+        order = np.argpartition(xyz[rows, axis], middle)
+        left += [rows[order[middle:]], rows[order[:middle]]]
+    return tiles
+
+
+class Tiling:
+    """The patches of one pass over points xyz (N, 3), whose rows were parted into `tiles` by `split`.
+
+    One tile is the whole cloud, cut as `cut_patches` does. Of several, each is cut together with its halo, the
+    points around it that its patches reach; a point's owner is always a patch of its own tile's cut.
+    """
+
+    def __init__(
+        self,
+        xyz: npt.NDArray[np.float64],
+        tiles: list[npt.NDArray[np.int64]],
+        *,
+        coverage: float,
+        seed: int,
+        device: str = "cpu",
+    ) -> None:
+        self._xyz, self._tiles = xyz, tiles
+        cut = cut_patches if device == "cpu" else partial(cut_patches_on, torch.device(device))
+        self._cut: Callable[[npt.NDArray[np.float64]], Patches] = partial(cut, coverage=coverage, seed=seed)
+        self._margins: list[float] = []
+
+    @cached_property
+    def whole(self) -> Patches | None:
+        """The cut of the whole cloud, where it is one tile."""
+        if len(self._tiles) > 1:
+            return None
+        return self._cut(self._xyz)
+
+    def probes(self, count: int) -> tuple[Patches, range]:
+        """Return about `count` patches spread over the cloud, to look at, and which of the whole cut they are."""
+        if self.whole is not None:
+            step = max(1, len(self.whole.seeds) // count)
+            return self.whole.every(step), range(0, len(self.whole.seeds), step)
+        found, self._margins = [], []
+        for core in self._tiles:
+            share = max(2, round(count * len(core) / len(self._xyz)))
+            seeds = core[np.linspace(0, len(core) - 1, share).astype(np.int64)]
+            patches = patches_around(cKDTree(self._xyz[core]), self._xyz[seeds], PATCH_SIZE)
+            self._margins.append(_HALO_RADII * float(np.percentile(patches.radii, _SPARSEST)))
+            found.append(patches.of_rows(core))
+        return Patches.joined(found), range(0)
+
+    def cuts(self) -> Iterator[Patches]:
+        """Cut tile after tile; together the patches own every point once. Call `probes` before."""
+        if self.whole is not None:
+            yield self.whole
+            return
+        for core, margin in zip(self._tiles, self._margins, strict=True):
+            rows = np.concatenate([core, _halo(self._xyz, core, margin)])
+            cut = self._cut(self._xyz[rows])
+            yield cut.owning_below(len(core)).of_rows(rows)
+
+
+def _halo(xyz: npt.NDArray[np.float64], core: npt.NDArray[np.int64], margin: float) -> npt.NDArray[np.int64]:
+    """Return the rows outside `core` in its box widened by `margin`; the nearest, where they outnumber the core."""
+    low, high = xyz[core].min(axis=0), xyz[core].max(axis=0)
+    near = np.ones(len(xyz), dtype=bool)
+    for axis in range(3):
+        column = xyz[:, axis]
+        near &= (column >= low[axis] - margin) & (column <= high[axis] + margin)
+    near[core] = False
+    rows = np.flatnonzero(near)
+    if len(rows) > len(core):
+        outside = np.maximum(low - xyz[rows], xyz[rows] - high).clip(min=0)
+        rows = rows[np.argpartition(np.square(outside).sum(axis=1), len(core))[: len(core)]]
+    return rows

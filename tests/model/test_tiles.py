@@ -1,0 +1,66 @@
+"""A cloud cut tile by tile is filtered as if it were cut at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from straightpcf.model.filter import Filter, load_filter
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.tiles import MIN_TILE_POINTS, Tiling, split
+from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import distance_to_torus, noisy, torus
+
+
+@settings(max_examples=25, deadline=None)
+@given(count=st.integers(1, 3000), tile_points=st.integers(1, 1000), equal=st.booleans())
+def test_every_row_is_in_one_tile_and_none_is_too_large(count: int, tile_points: int, *, equal: bool) -> None:
+    xyz = np.zeros((count, 3)) if equal else torus(count)
+    tiles = split(xyz, tile_points)
+    assert np.array_equal(np.sort(np.concatenate(tiles)), np.arange(count))
+    assert max(map(len, tiles)) <= tile_points
+
+
+def test_every_point_is_owned_once_by_patches_of_its_own_tiles_cut() -> None:
+    xyz = noisy(torus(30_000), 0.01)
+    tiles = split(xyz, 10_000)
+    tiling = Tiling(xyz, tiles, coverage=3, seed=0)
+    tiling.probes(48)
+    owned = [np.concatenate([cut.owned_points(m) for m in range(len(cut.seeds))]) for cut in tiling.cuts()]
+    assert [sorted(rows) for rows in owned] == [tile.tolist() for tile in tiles]
+
+
+def test_a_halo_that_would_be_the_whole_cloud_is_held_to_the_size_of_its_tile() -> None:
+    # Half of the points lie in one dense spot, so sparse patches reach everywhere.
+    xyz = np.concatenate([0.001 * torus(20_000), torus(20_000)])
+    tiling = Tiling(xyz, split(xyz, 10_000), coverage=3, seed=0)
+    tiling.probes(48)
+    for cut, tile in zip(tiling.cuts(), split(xyz, 10_000), strict=True):
+        assert len(np.unique(cut.index)) <= 2 * len(tile)
+
+
+def test_no_seam_is_to_be_seen() -> None:
+    clean = torus(40_000)
+    xyz = noisy(clean, 0.01)
+    options = DenoiseOptions(iterations=1)
+    model = load_filter(device="cpu")
+    at_once = model.denoise(xyz, options).xyz
+    in_tiles = Filter(model.network, calibration=model.calibration, tile_points=10_000).denoise(xyz, options).xyz
+    tile_of = np.empty(len(xyz), dtype=int)
+    for number, tile in enumerate(split(xyz, 10_000)):
+        tile_of[tile] = number
+    _, near = cKDTree(xyz).query(xyz, k=64)
+    at_a_seam = (tile_of[near] != tile_of[:, None]).any(axis=1)
+    assert 0.02 < at_a_seam.mean() < 0.5
+    off = [np.square(distance_to_torus(cloud[at_a_seam])).mean() for cloud in (in_tiles, at_once)]
+    assert off[0] < 1.05 * off[1]
+    assert np.linalg.norm(in_tiles - at_once, axis=1)[at_a_seam].mean() < 0.2 * np.abs(xyz - clean).mean()
+
+
+def test_tiles_smaller_than_a_few_patches_are_refused() -> None:
+    with pytest.raises(InvalidOptions, match=f"at least {MIN_TILE_POINTS}"):
+        Filter(StraightPCF(width=16, distance_width=16), tile_points=1000)
