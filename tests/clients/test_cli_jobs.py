@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import pytest
 
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, clean_environment
+from tests.waiting import wait_for
 
 POINTS = 400
 
@@ -109,16 +109,15 @@ def test_watch_once_does_what_is_there_and_tells_what_failed(scan: Path) -> None
 
 def test_watch_takes_what_comes_later_from_a_server(server: RunningServer, scan: Path, tmp_path: Path) -> None:
     (folder := tmp_path / "in").mkdir()
+    log = tmp_path / "log"
     command = [sys.executable, "-m", "straightpcf.clients.cli", "watch", str(folder), "--iterations", "1"]
-    process = subprocess.Popen([*command, "--url", server.url], env=clean_environment(), stderr=subprocess.PIPE)
+    with log.open("wb") as stderr:
+        process = subprocess.Popen([*command, "--url", server.url], env=clean_environment(), stderr=stderr)
     try:
         (folder / "late.npy").write_bytes(scan.read_bytes())
-        deadline = time.monotonic() + 60
-        while not (folder / "clean" / "late.npy").exists() and time.monotonic() < deadline:
-            time.sleep(0.1)
+        wait_for(lambda: b"late.npy: 400 points" in log.read_bytes(), seconds=60)
         assert np.load(folder / "clean" / "late.npy").shape == (POINTS, 3)
     finally:
         os.kill(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=20)
+        process.wait(timeout=20)
     assert process.returncode == 130
-    assert b"late.npy: 400 points" in said
