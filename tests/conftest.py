@@ -53,7 +53,8 @@ class RunningServer:
 
     def spooled_files(self) -> list[Path]:
         folders = (self.data_dir / "jobs", self.data_dir / "incoming")
-        return [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+        # os.walk, unlike Path.rglob, passes over a folder that a finished job takes away meanwhile.
+        return [Path(at, name) for folder in folders for at, _, names in os.walk(folder) for name in names]
 
     def delete_jobs(self) -> None:
         """Delete every job, running or not; its files are gone when the answer comes."""
