@@ -42,14 +42,13 @@ def main() -> None:
     clouds = _clouds(arguments.data, arguments.clouds)
     traces = _traces(Filter(network, threads=arguments.threads), clouds, arguments.noise, arguments.traces)
     calibration = calibrate(traces)
-    columns = f"{'d before each pass':32} {'moved x1e3':24} {'CD x1e4 after 0, 1, ...':42}"
+    columns = f"{'d before each pass':32} {'CD x1e4 after 0, 1, ...':42}"
     print(f"{'cloud':18} {'noise':>7}  {columns} auto best")
     for t in traces:
         chosen, best = passes(calibration, t), int(np.argmin(t.chamfer))
         distances = " ".join(f"{d:.3f}" for d in t.distances)
-        moved = " ".join(f"{1e3 * m:5.2f}" for m in t.moves)
         chamfer = " ".join(f"{1e4 * c:7.3f}" for c in t.chamfer)
-        print(f"{t.cloud:18} {t.noise_std:7.4f}  {distances:32} {moved:24} {chamfer:42} {chosen:4} {best:4}")
+        print(f"{t.cloud:18} {t.noise_std:7.4f}  {distances:32} {chamfer:42} {chosen:4} {best:4}")
     print(f"\n{'noise':>7} {'d':>7} {'auto / best CD':>15}")
     for std in sorted({t.noise_std for t in traces}):
         those = [t for t in traces if t.noise_std == std]

@@ -79,7 +79,7 @@ def _ours(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing
     done: list[tuple[int, int]] = []  # each patch's points, and how many of them were wanted
     move = model.move
 
-    def counted(x: Any, owned: Any, distance: Any) -> Any:
+    def counted(x: Any, owned: Any, distance: Any = None) -> Any:
         done.extend((x.shape[1], int(rows)) for rows in owned)
         return move(x, owned, distance)
 

@@ -145,11 +145,11 @@ class Filter:
         keep_large_buffers()
 
     def move(
-        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor
+        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor | None = None
     ) -> list[npt.NDArray[np.float64]]:
         """Return how far the first owned[i] points of each patch move: (B, P, 3) float32 -> B x (owned[i], 3).
 
-        distance: (B, 1), the d of the paper.
+        distance: (B, 1), where the DistanceModule has been asked before.
 
         A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
         is too many.
@@ -165,7 +165,7 @@ class Filter:
                     rows=rows,
                     owned=torch.from_numpy(owned[some]).to(x.device),
                     full_evaluations=self.full_evaluations,
-                    distance=distance[some],
+                    distance=None if distance is None else distance[some],
                 )
                 displacements = (moved - x[some, :rows]).double().cpu().numpy()
             except torch.OutOfMemoryError as exc:
@@ -223,7 +223,6 @@ class Run:
         self.distances: list[float] = []
         self.scene = False
         self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
-        self.moves: list[float] = []  # the median displacement of each pass, in the frame the network sees
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
@@ -269,14 +268,12 @@ class Run:
         self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor, left: int
     ) -> Iterator[FinishedPatch]:
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
-        lengths = np.empty(len(here), dtype=np.float32)
         settled = 0
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for cut in tiling.cuts():
             scales = patch_scales(cut.radii, scene=self.scene)
             for patch, displacement in self._displacements(here, cut, scales, pool):
                 owned = cut.owned_points(patch)
-                lengths[owned] = np.linalg.norm(displacement, axis=1)
                 self.moved[owned] += displacement / scales[patch]
                 settled += len(owned)
                 copies = self.points.copies(owned)
@@ -285,7 +282,6 @@ class Run:
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
                 progress = (done_before + settled / len(here)) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
-        self.moves.append(float(np.median(lengths)))
 
     def _displacements(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
@@ -295,12 +291,9 @@ class Run:
 
         def move(first: int) -> list[npt.NDArray[np.float64]]:
             chosen = range(first, min(first + step, len(cut.seeds)))
-            patches = self._tensor(here, cut, scales, chosen)
-            if all(i in self.probed for i in chosen):
-                distance = torch.tensor([[self.probed[i]] for i in chosen], device=patches.device)
-            else:
-                distance = self.filter.network.distance_module(patches)
-            return self.filter.move(patches, cut.owned[first : chosen.stop], distance)
+            known = [self.probed[i] for i in chosen if i in self.probed]
+            distance = torch.tensor(known, device=self.filter.device)[:, None] if len(known) == len(chosen) else None
+            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop], distance)
 
         starts = range(0, len(cut.seeds), step)
         results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
@@ -355,7 +348,7 @@ class _Distinct:
 
 
 def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
-    """Say whether any two rows may be equal: by hashes, for sorting whole rows takes ten times a row's memory."""
+    """Say whether any two rows may be equal: by hashes, which are sorted in a third of the memory of rows."""
     hashed = np.zeros(len(xyz), dtype=np.uint64)
     for axis in range(3):
         hashed *= np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits

@@ -16,29 +16,27 @@ from straightpcf.points.options import DenoiseOptions
 __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "passes", "trace"]
 
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
-_MOST_PASSES = 4
 
 
 @dataclass(frozen=True)
 class Trace:
-    """One noisy cloud on its way: d before each pass and after the last, each pass's move, CD from 0 passes on."""
+    """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on."""
 
     cloud: str
     noise_std: float
     distances: tuple[float, ...]
-    moves: tuple[float, ...]
     chamfer: tuple[float, ...]
 
 
 def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std: float, *, seed: int = 0) -> Trace:
     """Add Gaussian noise of `noise_std` radii to a clean unit-sphere cloud (N, 3) and filter it pass by pass."""
     noisy = clean + noise_std * np.random.default_rng(seed).standard_normal(clean.shape)
-    run = Run(filter_, noisy, DenoiseOptions(iterations=_MOST_PASSES))
+    run = Run(filter_, noisy, DenoiseOptions(iterations=filter_.calibration.most))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
     chamfer = tuple(chamfer_distance(x, clean) for x in states.values())
-    return Trace(name, noise_std, tuple(run.distances), tuple(run.moves), chamfer)
+    return Trace(name, noise_std, tuple(run.distances), chamfer)
 
 
 def calibrate(traces: Sequence[Trace]) -> Calibration:

@@ -11,7 +11,7 @@ from straightpcf.points.errors import MalformedFile
 
 
 def trace(noise_std: float, *distances: float) -> Trace:
-    return Trace("cloud", noise_std, distances, (0.0,) * 4, (1.0,) * 5)
+    return Trace("cloud", noise_std, distances, (1.0,) * 5)
 
 
 def test_the_table_of_noise_levels_is_read_off_traces() -> None:
