@@ -237,13 +237,15 @@ def train(
     run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that is found there is resumed.")],
     iterations: Annotated[int, typer.Option(min=1)] = 20_000,
     batch_size: Annotated[int, typer.Option(min=1)] = 16,
-    learning_rate: Annotated[float, typer.Option(min=0.0, help="Adam's, at its peak.")] = 1e-3,
+    learning_rate: Annotated[float, typer.Option(min=0.0, help="At its peak.")] = 1e-3,
     rows: Annotated[int, typer.Option(min=1, max=1000, help="Points of a patch in the loss.")] = 256,
     couplings: Annotated[int, typer.Option(min=1, max=8, help="K, the velocity modules of the stack.")] = 2,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     device: Annotated[str, typer.Option(metavar="cpu|cuda")] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
-    init: Annotated[Path | None, typer.Option(help="The state of the stage before.")] = None,
+    init: Annotated[Path | None, typer.Option(help="The state to start from.")] = None,
+    distance: Annotated[Path | None, typer.Option(help="A state whose DistanceModule to start from instead.")] = None,
+    settled: Annotated[bool, typer.Option("--settled", help="No dropout, BatchNorm as it is: to train on.")] = False,
     minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after these, with the state saved.")] = None,
 ) -> None:
     """Train one stage; resumable, logged as CSV."""
@@ -264,6 +266,8 @@ def train(
             device=device,
             threads=threads,
             init=init,
+            distance=distance,
+            settled=settled,
             minutes=minutes,
             on_step=lambda step: show(step.iteration / step.iterations, f"loss {step.loss:.3e}"),
         )

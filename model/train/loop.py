@@ -19,8 +19,9 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
+from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import Average, load_state, read_network, save_state
-from straightpcf.model.train.step import GraphedStep, HostStep, Step, adam
+from straightpcf.model.train.step import GraphedStep, HostStep, Step
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
@@ -29,6 +30,7 @@ Stage = Literal["vm", "cvm", "dm"]
 STATE_FILE = "state.safetensors"
 _LOSSES = {"vm": velocity_loss, "cvm": coupled_loss, "dm": distance_loss}
 _WARMUP = 200
+_TURN_EVERY = 10  # iterations between two turns of the optimiser's bases
 _EMA_DECAY = 0.999
 _LOG_EVERY = 50
 _VALIDATE_EVERY = 250
@@ -37,7 +39,7 @@ _VALIDATION_PATCHES = 64
 
 @dataclass(frozen=True)
 class TrainStep:
-    """One iteration as it was: losses are relative to a network that does nothing; validation is None in between."""
+    """One iteration as it was; validation is None in between."""
 
     iteration: int
     iterations: int
@@ -61,13 +63,17 @@ def train(
     threads: int | None = None,
     minutes: float | None = None,
     init: Path | None = None,
+    distance: Path | None = None,
+    settled: bool = False,
     on_step: Callable[[TrainStep], None] | None = None,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
-    init: the state of the stage before (needed by "cvm" and "dm" on a fresh run). rows: points of a patch
-    in the loss. The learning rate warms up, then falls along half a cosine to 2 % at `iterations`. minutes: stop
-    there with the state saved, to go on another time (a GPU may be lent for ten minutes at once).
+    init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage.
+    distance: a state whose DistanceModule to start from instead. rows: points of a patch in the loss. settled: without
+    dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
+    up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
+    another time (a GPU may be lent for ten minutes at once).
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
     and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
     """
@@ -80,11 +86,14 @@ def train(
     state_path = run_dir / STATE_FILE
     place = torch.device(device)
 
-    network = _network(stage, None if state_path.exists() else init, couplings, resuming=state_path.exists()).to(place)
+    resuming = state_path.exists()
+    network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
+    if distance is not None and not resuming:
+        network.distance_module.load_state_dict(read_network(distance)[0].distance_module.state_dict())
     trained = _trained_part(stage, network)
-    optimiser = adam(trained, place)
+    optimiser = SOAP(trained.parameters())
     average = Average(network, _EMA_DECAY)
-    start = load_state(state_path, network, average, optimiser, rng)["iteration"] if state_path.exists() else 0
+    start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
     source = PatchSource.read(data)
     loss_of = partial(_LOSSES[stage], network, rows=rows)
@@ -102,11 +111,13 @@ def train(
             log.writerow(["stage", "iteration", "loss", "validation", "learning_rate", "seconds"])
         recent: list[float] = []
         recent_loss = math.nan
-        trained.train()
+        trained.train(not settled)
         for iteration in range(start + 1, iterations + 1):
             rate = _learning_rate(learning_rate, iteration, iterations)
             loss = step(rate)
             average.update(iteration)
+            if iteration % _TURN_EVERY == 0:
+                optimiser.turn_bases()
             last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
             # On CUDA reading the loss waits for the device: only where it is reported.
             if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last:
@@ -134,7 +145,7 @@ def train(
 
 def _network(stage: Stage, init: Path | None, couplings: int, *, resuming: bool) -> StraightPCF:
     count = 1 if stage == "vm" else couplings
-    if stage == "vm" or resuming:
+    if init is None and (stage == "vm" or resuming):
         network = StraightPCF(couplings=count)
         for module in network.velocity_modules:
             module.start_slow()  # type: ignore[operator]

@@ -1,4 +1,9 @@
-"""The three objectives of the paper, in units of the training noise: 1 is what a network that does nothing gets."""
+"""The three objectives of the paper, errors of velocities and places weighted by what the noise leaves knowable.
+
+Along the surface nobody can tell where a noisy point came from: two thirds of |v - (y - x_0)|^2 are that noise, nearly
+all of its gradient's variance, and no network removes them. So errors are weighted as in generalised least squares
+(Aitken 1936), by the inverse of the target's covariance given the clean points around (`precision`).
+"""
 
 from __future__ import annotations
 
@@ -9,18 +14,21 @@ import torch
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import NOISE_STD, Batch
 
-__all__ = ["LAMBDA_1", "LAMBDA_2", "coupled_loss", "distance_loss", "velocity_loss"]
+__all__ = ["LAMBDA_1", "LAMBDA_2", "coupled_loss", "distance_loss", "precision", "velocity_loss"]
 
 LAMBDA_1 = 10.0
 LAMBDA_2 = 200.0
 _TRAJECTORIES = 0.25  # the share of a batch that L_C moves
 _UNIT = 3 * NOISE_STD**2  # the mean of |y - x_0|^2
+# Spread of the target, in units of the noise at time t, below which an error counts in full.
+_KNOWABLE = 0.3
+_LATEST = 0.9  # the noise at time t is taken as no less than at this one: float32 covariances bear no less
 
 
 def velocity_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
     """L_A: |v(x_t) - (y - x_0)|^2 over the first `rows` points of each patch (stage 1)."""
     velocity = network.velocity_modules[0](batch.at(batch.time), rows)
-    return _squared(velocity - (batch.clean - batch.noisy)[:, :rows])
+    return _weighted(velocity - (batch.clean - batch.noisy)[:, :rows], precision(batch, rows))
 
 
 def coupled_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
@@ -31,17 +39,38 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
     """
     couplings = len(network.velocity_modules)
     target = batch.clean - batch.noisy
+    weight = precision(batch, target.shape[1])
     x = batch.at(batch.time)
     step = (1 - batch.time) / couplings
     loss = x.new_zeros(())
     for k, velocity in enumerate(network.velocity_modules, start=1):
         last = k == couplings
         v = velocity(x, rows if last else None)
-        loss = loss + _squared(v - target[:, : v.shape[1]])
+        loss = loss + _weighted(v - target[:, : v.shape[1]], weight[:, : v.shape[1]])
         if not last:
             x = x + step * v
-            loss = loss + LAMBDA_1 * _squared(x - batch.at(batch.time + k * step))
+            loss = loss + LAMBDA_1 * _weighted(x - batch.at(batch.time + k * step), weight)
     return loss
+
+
+@torch.no_grad()
+def precision(batch: Batch, rows: int) -> torch.Tensor:
+    """Weigh the errors of the first `rows` points of each patch: (B, rows, 3, 3), symmetric, eigenvalues in (0, 1].
+
+    s^2 (C + s^2 I)^-1, where C is the covariance of the clean points that x_t may have come from, each as likely as
+    the noise at time t makes it, and s is 0.3 of that noise: about 1 across a surface, 1/12 along it, and 1 throughout
+    where the noise is smaller than the distance between points. It depends on x_t and the clean points, not on which of
+    them is the target: the velocity of least weighted error is still a mean of y - x_0, in which clean clouds that tell
+    more of it count for more.
+    """
+    x = batch.at(batch.time)[:, :rows]
+    noise = NOISE_STD * (1 - batch.time).clamp(min=1 - _LATEST)
+    likely = torch.softmax(torch.cdist(x, batch.clean).square() * (-0.5 / noise.square()), dim=2)  # (B, rows, P)
+    first, second = torch.triu_indices(3, 3, device=x.device)
+    moments = likely @ torch.cat([batch.clean, batch.clean[:, :, first] * batch.clean[:, :, second]], dim=2)
+    mean, square = moments[:, :, :3], moments[:, :, 3:]
+    spread = (square - mean[:, :, first] * mean[:, :, second]) / (_KNOWABLE * noise).square()
+    return _inverse_of_one_plus(spread)
 
 
 def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
@@ -59,8 +88,19 @@ def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor
     for k, velocity in enumerate(network.velocity_modules, start=1):
         v = velocity(x, rows if k == couplings else None)
         x = x[:, : v.shape[1]] + distance / couplings * v
-    return torch.add(loss, LAMBDA_2 * _UNIT * _squared(x - clean[:, : x.shape[1]]))
+    return torch.add(loss, LAMBDA_2 * (x - clean[:, : x.shape[1]]).square().sum(dim=2).mean())
 
 
-def _squared(error: torch.Tensor) -> torch.Tensor:
-    return error.square().sum(dim=2).mean() / _UNIT
+def _weighted(error: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    return torch.einsum("bpi,bpij,bpj->bp", error, weight, error).mean() / _UNIT
+
+
+def _inverse_of_one_plus(spread: torch.Tensor) -> torch.Tensor:
+    """Invert I + S for symmetric S given by its upper triangle (..., 6): by cofactors, which a CUDA graph can hold."""
+    xx, xy, xz, yy, yz, zz = spread.unbind(dim=-1)
+    xx, yy, zz = xx + 1, yy + 1, zz + 1
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    determinant = xx * a + xy * b + xz * c
+    cofactors = torch.stack([a, b, c, b, d, e, c, e, f], dim=-1)
+    return (cofactors / determinant[..., None]).view(*determinant.shape, 3, 3)

@@ -46,7 +46,9 @@ def save_state(
         if not torch.equal(tensor, average.tensors[name]):  # what is frozen is its own average
             tensors[f"weights.{name}"] = tensor.detach().cpu().clone().contiguous()
     for index, moments in optimiser.state_dict()["state"].items():
-        tensors |= {f"adam.{index}.{name}": torch.as_tensor(t).cpu().clone() for name, t in moments.items()}
+        tensors |= {
+            f"optimiser.{index}.{name}": torch.as_tensor(t).cpu().clone().contiguous() for name, t in moments.items()
+        }
     tensors["torch_rng"] = torch.get_rng_state()
     if torch.cuda.is_available():
         tensors["cuda_rng"] = torch.cuda.get_rng_state()
@@ -64,7 +66,7 @@ def load_state(
     network.load_state_dict(_under(tensors, "average.") | _under(tensors, "weights."))
     average.tensors = {name: t.to(average.tensors[name].device) for name, t in _under(tensors, "average.").items()}
     moments: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in _under(tensors, "adam.").items():
+    for name, tensor in _under(tensors, "optimiser.").items():
         index, moment = name.split(".")
         moments.setdefault(int(index), {})[moment] = tensor
     optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})

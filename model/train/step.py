@@ -9,22 +9,15 @@ import torch
 
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource
+from straightpcf.model.train.soap import SOAP
 
-__all__ = ["GraphedStep", "HostStep", "Step", "adam"]
+__all__ = ["GraphedStep", "HostStep", "Step"]
 
 GRADIENT_NORM = 1.0
-_BETAS = (0.9, 0.99)
 _EAGER_STEPS = 3  # before the capture, so that every buffer and workspace is there
 
 Loss = Callable[[Batch], torch.Tensor]
 Step = Callable[[float], torch.Tensor]  # learning rate -> loss, a tensor that the next step may overwrite
-
-
-def adam(trained: torch.nn.Module, device: torch.device) -> torch.optim.Adam:
-    """Return the optimiser; on CUDA its learning rate and step are tensors, as a graph needs them."""
-    on_cuda = device.type == "cuda"
-    rate = torch.tensor(0.0, device=device) if on_cuda else 0.0
-    return torch.optim.Adam(trained.parameters(), lr=rate, betas=_BETAS, capturable=on_cuda)
 
 
 class HostStep:
@@ -35,7 +28,7 @@ class HostStep:
         source: PatchSource,
         loss: Loss,
         trained: torch.nn.Module,
-        optimiser: torch.optim.Optimizer,
+        optimiser: SOAP,
         rng: np.random.Generator,
         batch_size: int,
     ) -> None:
@@ -57,12 +50,14 @@ class GraphedStep:
         source: PatchSource,
         loss: Loss,
         trained: torch.nn.Module,
-        optimiser: torch.optim.Optimizer,
+        optimiser: SOAP,
         device: torch.device,
         batch_size: int,
     ) -> None:
         self._source = DevicePatchSource(source, device)
-        self._rates = [group["lr"] for group in optimiser.param_groups]
+        self._rate = torch.zeros((), device=device)
+        for group in optimiser.param_groups:
+            group["lr"] = self._rate  # a graph reads it from memory
         self._eager_left = _EAGER_STEPS
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result = torch.zeros((), device=device)
@@ -70,8 +65,7 @@ class GraphedStep:
 
     def __call__(self, learning_rate: float) -> torch.Tensor:
         """Make one update; the first few run eagerly on a side stream, then one is captured."""
-        for rate in self._rates:
-            rate.fill_(learning_rate)
+        self._rate.fill_(learning_rate)
         if self._graph is not None:
             self._graph.replay()
         elif self._eager_left > 0:
@@ -89,7 +83,7 @@ class GraphedStep:
         return self._result
 
 
-def _update(batch: Batch, loss_of: Loss, trained: torch.nn.Module, optimiser: torch.optim.Optimizer) -> torch.Tensor:
+def _update(batch: Batch, loss_of: Loss, trained: torch.nn.Module, optimiser: SOAP) -> torch.Tensor:
     optimiser.zero_grad(set_to_none=True)
     loss = loss_of(batch)
     loss.backward()  # type: ignore[no-untyped-call]

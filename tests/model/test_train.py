@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from straightpcf.model.train import Stage, train
-from straightpcf.model.train.data import PATCH_SIZE, PatchSource
+from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
+from straightpcf.model.train.losses import precision
+from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import InvalidOptions
 from tests.clouds import sphere, torus
@@ -91,6 +93,41 @@ def test_most_points_of_the_loss_are_near_the_seed(data: Path, *, on_device: boo
     assert (rank[:, :256] >= PATCH_SIZE // 2).any()
 
 
+@pytest.mark.parametrize(("time", "along"), [(0.0, 1 / 12), (0.5, 1 / 12), (0.95, 1.0)])
+def test_errors_along_a_surface_count_only_where_the_noise_leaves_them_knowable(time: float, along: float) -> None:
+    # A plane of points 0.0125 apart: noise of 0.02 and 0.01 blurs them, of 0.001 does not.
+    side = torch.linspace(-0.2, 0.2, 33)
+    plane = torch.cartesian_prod(side, side, torch.zeros(1))[None]
+    torch.manual_seed(0)
+    noisy = plane + NOISE_STD * torch.randn_like(plane)
+    inner = (plane.abs() < 0.12).all(dim=2)[0]
+    weight = precision(Batch(noisy, plane, torch.full((1, 1, 1), time)), plane.shape[1])[0, inner]
+    torch.testing.assert_close(weight, weight.mT)
+    across, others = weight[:, 2, 2], weight[:, :2, :2].diagonal(dim1=1, dim2=2)
+    assert across.mean() == pytest.approx(1, abs=0.02)
+    assert others.mean() == pytest.approx(along, rel=0.15)
+
+
+def test_soap_finds_the_axes_of_an_ill_conditioned_problem() -> None:
+    torch.manual_seed(0)
+    left, right = (torch.linalg.qr(torch.randn(12, 12)).Q for _ in range(2))
+    scale = torch.logspace(0, -1, 12)
+    wanted = torch.randn(12, 12)
+
+    def distance_after(steps: int, optimiser_of: type[torch.optim.Optimizer]) -> float:
+        w = torch.nn.Parameter(torch.zeros(12, 12))
+        optimiser = optimiser_of([w], lr=0.1)
+        for step in range(1, steps + 1):
+            optimiser.zero_grad()
+            (scale[:, None] * (left @ (w - wanted) @ right) * scale).square().sum().backward()
+            optimiser.step()
+            if isinstance(optimiser, SOAP) and step % 10 == 0:
+                optimiser.turn_bases()
+        return (w.detach() - wanted).norm().item()
+
+    assert distance_after(200, SOAP) < 0.05 * distance_after(200, torch.optim.Adam)
+
+
 def test_random_rotations_are_rotations() -> None:
     turn = random_rotations(50, torch.device("cpu"))
     torch.testing.assert_close(turn @ turn.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0)
@@ -134,6 +171,37 @@ def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> Non
               on_step=lambda step: seen.append(step.iteration))  # fmt: skip
     assert seen == [1, 2, 3, 4]
     assert (tmp_path / "log.csv").read_text().count("stage") == 1
+
+
+def test_an_interrupted_run_ends_with_the_weights_of_an_uninterrupted_one(data: Path, tmp_path: Path) -> None:
+    once, twice = tmp_path / "once", tmp_path / "twice"
+    train("vm", data=data, run_dir=once, iterations=12, batch_size=1, threads=1)
+    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1, minutes=0.0)
+    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1)
+    assert same(weights(once / "state.safetensors"), weights(twice / "state.safetensors"))
+
+
+def test_a_settled_run_keeps_the_statistics_and_can_start_from_its_own_stage(
+    data: Path, tmp_path: Path, velocity_run: Path
+) -> None:
+    path = train(
+        "vm", data=data, run_dir=tmp_path, iterations=2, batch_size=2, threads=1, init=velocity_run, settled=True
+    )
+    before, after = weights(velocity_run), weights(path)
+    moved = {name.rsplit(".", 1)[1] for name in before if not torch.equal(before[name], after[name])}
+    assert moved == {"weight", "bias"}
+
+
+def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: Path, velocity_run: Path) -> None:
+    def run(stage: Stage, name: str, init: Path, distance: Path | None = None) -> Path:
+        return train(stage, data=data, run_dir=tmp_path / name, iterations=1, batch_size=1, threads=1, init=init,
+                     distance=distance)  # fmt: skip
+
+    coupled = run("cvm", "cvm", velocity_run)
+    other = run("dm", "dm", coupled)
+    joined = weights(run("cvm", "joined", coupled, distance=other))
+    theirs = {name: tensor for name, tensor in weights(other).items() if name.startswith("distance_module")}
+    assert same(theirs, joined)
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:

@@ -1,0 +1,78 @@
+"""SOAP: Adam in the slowly turning eigenbasis of Shampoo's preconditioner (Vyas et al. 2024, arXiv:2409.11321)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+__all__ = ["SOAP"]
+
+_BETAS = (0.9, 0.99)
+_FACTOR_BETA = 0.99
+_EPS = 1e-8
+
+
+class SOAP(torch.optim.Optimizer):
+    """Adam on each matrix's gradient turned into the eigenvectors of E[G G^T] and E[G^T G]; plain Adam on vectors.
+
+    `step` has no host-side condition, so a CUDA graph can hold it; `turn_bases` is called beside it, every few steps.
+    The learning rate may be a tensor. Every value of the state is a tensor.
+    """
+
+    def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: float | torch.Tensor = 1e-3) -> None:
+        super().__init__(parameters, {"lr": lr})
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """Make one update from the gradients that are there."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                gradient = parameter.grad
+                if gradient is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    self._start(state, gradient)
+                if gradient.ndim == 2:
+                    state["left"].lerp_(gradient @ gradient.T, 1 - _FACTOR_BETA)
+                    state["right"].lerp_(gradient.T @ gradient, 1 - _FACTOR_BETA)
+                turned = _into_basis(gradient, state)
+                state["step"].add_(1)
+                state["mean"].lerp_(gradient, 1 - _BETAS[0])
+                state["square"].lerp_(turned.square(), 1 - _BETAS[1])
+                mean = _into_basis(state["mean"], state) / (1 - _BETAS[0] ** state["step"])
+                square = state["square"] / (1 - _BETAS[1] ** state["step"])
+                parameter.sub_(_out_of_basis(mean / (square.sqrt() + _EPS), state) * group["lr"])
+
+    @torch.no_grad()
+    def turn_bases(self) -> None:
+        """Take one step of the power iteration that keeps the bases at the factors' eigenvectors, in place."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                state = self.state[parameter]
+                for axis, side in enumerate(("left", "right") if "left" in state else ()):
+                    factor, basis = state[side], state[f"{side}_basis"]
+                    order = (basis * (factor @ basis)).sum(dim=0).argsort(descending=True)
+                    basis.copy_(torch.linalg.qr(factor @ basis[:, order]).Q)
+                    state["square"].copy_(state["square"].index_select(axis, order))
+
+    @staticmethod
+    def _start(state: dict[str, torch.Tensor], gradient: torch.Tensor) -> None:
+        state["step"] = torch.zeros((), device=gradient.device)
+        state["mean"] = torch.zeros_like(gradient)
+        state["square"] = torch.zeros_like(gradient)
+        if gradient.ndim == 2:
+            for side, factor in (("left", gradient @ gradient.T), ("right", gradient.T @ gradient)):
+                state[side] = torch.zeros_like(factor)
+                # In float64: of a gradient of low rank, LAPACK's float32 eigenvectors have come out as NaN.
+                basis = torch.linalg.eigh(factor.double()).eigenvectors.flip(1)
+                state[f"{side}_basis"] = basis.to(factor.dtype, memory_format=torch.contiguous_format)
+
+
+def _into_basis(x: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+    return state["left_basis"].T @ x @ state["right_basis"] if x.ndim == 2 else x
+
+
+def _out_of_basis(x: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+    return state["left_basis"] @ x @ state["right_basis"].T if x.ndim == 2 else x
