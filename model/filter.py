@@ -22,9 +22,9 @@ from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
 from straightpcf.model.patches import Patches
-from straightpcf.model.tiles import MIN_TILE_POINTS, Tiling, split
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints, TooLarge
-from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
 __all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
 

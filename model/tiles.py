@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 from straightpcf.model.device_patches import cut_patches_on
 from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches, patches_around
 
-__all__ = ["MIN_TILE_POINTS", "Tiling", "split"]
+__all__ = ["Tiling", "split"]
 
-MIN_TILE_POINTS = 10 * PATCH_SIZE  # half of it, the smallest tile, still has whole patches
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
 _SPARSEST = 90  # percentile of a tile's patch radii that its halo is made for

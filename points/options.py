@@ -8,9 +8,10 @@ from typing import Literal, TypeVar
 
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["MAX_ITERATIONS", "DenoiseOptions"]
+__all__ = ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
 
 MAX_ITERATIONS = 10
+MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
 _T = TypeVar("_T", int, float)
 
 

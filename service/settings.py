@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.options import MIN_TILE_POINTS
 
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
@@ -16,7 +17,7 @@ ENVIRONMENT_PREFIX = "STRAIGHTPCF_"
 _OF_CLIENTS = frozenset({"STRAIGHTPCF_URL", "STRAIGHTPCF_KEY"})  # what the CLI's other commands read
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
-    "max_sync_seconds", "result_ttl_seconds", "threads", "tile_points", "shutdown_seconds",
+    "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
 )  # fmt: skip
 
 
@@ -73,6 +74,8 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise InvalidOptions(f"{name} is {value}; it must be above 0")
+        if self.tile_points is not None and self.tile_points < MIN_TILE_POINTS:
+            raise InvalidOptions(f"tile_points is {self.tile_points}; it must be at least {MIN_TILE_POINTS}")
         for name in ("rate_per_minute", "min_free_bytes", "row_ttl_seconds"):
             if getattr(self, name) < 0:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must not be negative")

@@ -65,11 +65,10 @@ def precision(batch: Batch, rows: int) -> torch.Tensor:
     """
     x = batch.at(batch.time)[:, :rows]
     noise = NOISE_STD * (1 - batch.time).clamp(min=1 - _LATEST)
-    likely = torch.softmax(torch.cdist(x, batch.clean).square() * (-0.5 / noise.square()), dim=2)  # (B, rows, P)
-    first, second = torch.triu_indices(3, 3, device=x.device)
-    moments = likely @ torch.cat([batch.clean, batch.clean[:, :, first] * batch.clean[:, :, second]], dim=2)
-    mean, square = moments[:, :, :3], moments[:, :, 3:]
-    spread = (square - mean[:, :, first] * mean[:, :, second]) / (_KNOWABLE * noise).square()
+    parts = [(x, batch.clean, noise)]
+    if x.device.type == "cpu":  # one patch's tensors fit the cache, a batch's do not
+        parts = list(zip(*(t.chunk(len(x)) for t in (x, batch.clean, noise)), strict=True))
+    spread = torch.cat([_covariance(*part) / (_KNOWABLE * part[2]).square() for part in parts])
     return _inverse_of_one_plus(spread)
 
 
@@ -89,6 +88,17 @@ def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor
         v = velocity(x, rows if k == couplings else None)
         x = x[:, : v.shape[1]] + distance / couplings * v
     return torch.add(loss, LAMBDA_2 * (x - clean[:, : x.shape[1]]).square().sum(dim=2).mean())
+
+
+def _covariance(x: torch.Tensor, clean: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    """Return the upper triangle, (B, rows, 6), of the covariance of the clean points that x may have come from."""
+    scaled = clean / noise.square()
+    # -|x - y|^2 / (2 noise^2), less the part that a row has in common
+    likely = torch.softmax(x @ scaled.mT - 0.5 * (scaled * clean).sum(dim=2)[:, None], dim=2)  # (B, rows, P)
+    first, second = torch.triu_indices(3, 3, device=x.device)
+    moments = likely @ torch.cat([clean, clean[:, :, first] * clean[:, :, second]], dim=2)
+    mean, square = moments[:, :, :3], moments[:, :, 3:]
+    return square - mean[:, :, first] * mean[:, :, second]
 
 
 def _weighted(error: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,16 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire.patches import PatchFrame
 
-__all__ = ["MAX_MESSAGE_BYTES", "event_message", "event_of", "frame_of", "message_of", "patch_messages", "plain_of"]
+__all__ = [
+    "MAX_MESSAGE_BYTES",
+    "event_message",
+    "event_of",
+    "frame_of",
+    "message_of",
+    "name_of",
+    "patch_messages",
+    "plain_of",
+]
 
 MAX_MESSAGE_BYTES = 2**20
 MAX_PATCH_POINTS = 2**14  # 448 KiB; only points that lie in one place make a patch as large as that
@@ -130,8 +139,13 @@ def _plain_field(message: Message, field: Any) -> Any:
     if field.message_type is not None:
         return plain_of(value)
     if field.enum_type is not None:
-        return field.enum_type.values_by_number[value].name.removeprefix(_prefix(field.enum_type)).lower()
+        return name_of(field.enum_type, value)
     return value
+
+
+def name_of(kind: EnumDescriptor, number: int) -> str:
+    """Return an enum's value as JSON has it, JOB_STATE_QUEUED as "queued"; raises KeyError where there is none."""
+    return str(kind.values_by_number[number].name.removeprefix(_prefix(kind)).lower())
 
 
 def _number(kind: EnumDescriptor, name: str) -> int:

@@ -50,8 +50,10 @@ class Gate:
         now = time.monotonic()
         left, at = self._buckets.get(owner, (float(self._rate), now))
         left = min(float(self._rate), left + (now - at) * self._rate / _SECONDS)
-        self._buckets[owner] = (max(0.0, left - 1), now)
-        if left < 1:
+        granted = left >= 1
+        # What is refused takes nothing: whoever asks again too soon would never get in.
+        self._buckets[owner] = (left - 1 if granted else left, now)
+        if not granted:
             raise RateLimited(f"this key may send {self._rate} requests a minute")
 
 

@@ -19,7 +19,14 @@ from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire import straightpcf_pb2_grpc as stubs
-from straightpcf.points.wire.messages import MAX_MESSAGE_BYTES, event_message, message_of, patch_messages, plain_of
+from straightpcf.points.wire.messages import (
+    MAX_MESSAGE_BYTES,
+    event_message,
+    message_of,
+    name_of,
+    patch_messages,
+    plain_of,
+)
 from straightpcf.points.wire.patches import PatchReader
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.body import SpoolFile
@@ -288,6 +295,6 @@ def _event(event: JobEvent, record: JobRecord | None) -> pb.JobEvent:
 
 def _state(number: int) -> Any:
     try:
-        return pb.JobState.Name(number).removeprefix("JOB_STATE_").lower()
-    except ValueError:
+        return name_of(pb.JobState.DESCRIPTOR, number)
+    except KeyError:
         raise InvalidRequest(f"state {number} is unknown; the states are 1..7") from None

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.tiles import MIN_TILE_POINTS, Tiling, split
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import InvalidOptions
-from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, torus
 
 

@@ -272,6 +272,51 @@ def test_a_key_sees_its_own_jobs_alone(tmp_path: Path) -> None:
         assert "alpha" not in server.log.read_text()
 
 
+def test_a_key_that_asks_too_often_is_held_back_and_let_in_again(tmp_path: Path) -> None:
+    # 120 a minute: the bucket holds 120 and gains one each half second, however often it is asked meanwhile.
+    with run_server(tmp_path, environment={"STRAIGHTPCF_RATE_PER_MINUTE": "120"}) as server:
+        server.wait_until_ready()
+        with httpx2.Client(base_url=server.url, timeout=60) as http:
+            answers = [http.get("/jobs")]
+            while answers[-1].status_code == 200 and len(answers) < 2000:
+                answers.append(http.get("/jobs"))
+            assert len(answers) > 120
+            problem = answers[-1].json()
+            assert (problem["status"], problem["code"], problem["retryable"]) == (429, "rate_limited", True)
+            assert int(answers[-1].headers["retry-after"]) >= 1
+            assert http.get("/livez").status_code == 200
+            until = time.monotonic() + 10
+            while http.get("/jobs").status_code == 429:
+                assert time.monotonic() < until, "a client that keeps asking never gets in"
+
+
+def test_pages_of_other_origins_may_call_only_where_the_operator_says_so(server: RunningServer, tmp_path: Path) -> None:
+    friend, stranger = "https://viewer.example", "https://other.example"
+
+    def allowed(url: str, origin: str) -> str | None:
+        asks = {"Origin": origin, "Access-Control-Request-Method": "POST"}
+        preflight = httpx2.options(f"{url}/denoise", headers=asks).headers.get("access-control-allow-origin")
+        plain = httpx2.get(f"{url}/v1/info", headers={"Origin": origin}).headers.get("access-control-allow-origin")
+        assert preflight == plain
+        return preflight
+
+    assert allowed(server.url, friend) is None
+    with run_server(tmp_path, environment={"STRAIGHTPCF_CORS_ORIGINS": f"{friend}, https://third.example"}) as other:
+        other.wait_until_ready()
+        assert allowed(other.url, friend) == friend
+        assert allowed(other.url, stranger) is None
+
+
+def test_events_pass_proxies_at_once_and_the_trace_reaches_the_log(server: RunningServer, http: httpx2.Client) -> None:
+    trace = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+    id = make(http, traceparent=trace)["id"]
+    with http.stream("GET", f"/jobs/{id}/events") as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        assert (answer.headers["x-accel-buffering"], answer.headers["cache-control"]) == ("no", "no-store")
+        assert sse(answer.iter_lines())[-1]["event"] == "completed"
+    assert trace in server.log.read_text()
+
+
 def test_curl_follows_a_job_as_the_readme_says(server: RunningServer, tmp_path: Path) -> None:
     (tmp_path / "scan.npy").write_bytes(SMALL)
     curl = ["curl", "-sf", "--max-time", "60"]

@@ -41,6 +41,7 @@ def test_an_argument_wins_over_the_environment_and_none_does_not() -> None:
         ("STRAIGHTPCF_PORT", "many"),
         ("STRAIGHTPCF_PORT", "65536"),
         ("STRAIGHTPCF_MAX_JOBS", "0"),
+        ("STRAIGHTPCF_TILE_POINTS", "9999"),
     ],
 )
 def test_unknown_names_and_impossible_values_are_refused(variable: str, value: str) -> None:
