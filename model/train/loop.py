@@ -22,6 +22,7 @@ from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import Average, load_state, read_network, save_state
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
+from straightpcf.model.train.team import Team
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
@@ -61,6 +62,7 @@ def train(
     seed: int = 0,
     device: str = "cpu",
     threads: int | None = None,
+    processes: int = 1,
     minutes: float | None = None,
     init: Path | None = None,
     distance: Path | None = None,
@@ -73,10 +75,13 @@ def train(
     distance: a state whose DistanceModule to start from instead. rows: points of a patch in the loss. settled: without
     dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
     up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
-    another time (a GPU may be lent for ten minutes at once).
+    another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each batch, one thread
+    each; batch_size must be a multiple.
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
     and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
     """
+    if batch_size % processes or (processes > 1 and device != "cpu"):
+        raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
     if threads is not None:
         torch.set_num_threads(threads)
     keep_large_buffers()
@@ -97,10 +102,14 @@ def train(
 
     source = PatchSource.read(data)
     loss_of = partial(_LOSSES[stage], network, rows=rows)
+    share = batch_size // processes
+    team = None
+    if processes > 1:
+        team = Team(processes - 1, network, trained, partial(_LOSSES[stage], rows=rows), data, share, (seed, start))
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"
-        else HostStep(source, loss_of, trained, optimiser, rng, batch_size)
+        else HostStep(source, loss_of, trained, optimiser, rng, share, team)
     )
     fixed = PatchSource.read(data, validation=True).draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
@@ -140,6 +149,8 @@ def train(
             validation = None
             if last:
                 break
+    if team is not None:
+        team.close()
     return state_path
 
 

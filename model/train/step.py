@@ -10,6 +10,7 @@ import torch
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource
 from straightpcf.model.train.soap import SOAP
+from straightpcf.model.train.team import Team
 
 __all__ = ["GraphedStep", "HostStep", "Step"]
 
@@ -21,7 +22,7 @@ Step = Callable[[float], torch.Tensor]  # learning rate -> loss, a tensor that t
 
 
 class HostStep:
-    """Draw on the host with `rng`, then run eagerly."""
+    """Draw on the host with `rng`, then run eagerly, a team taking its share of the batch."""
 
     def __init__(
         self,
@@ -31,7 +32,9 @@ class HostStep:
         optimiser: SOAP,
         rng: np.random.Generator,
         batch_size: int,
+        team: Team | None = None,
     ) -> None:
+        self._team = team
         self._draw: Callable[[], Batch] = lambda: source.draw(rng, batch_size)
         self._loss, self._trained, self._optimiser = loss, trained, optimiser
 
@@ -39,7 +42,9 @@ class HostStep:
         """Make one update."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
-        return _update(self._draw(), self._loss, self._trained, self._optimiser)
+        if self._team is not None:
+            self._team.start(training=self._trained.training)
+        return _update(self._draw(), self._loss, self._trained, self._optimiser, self._team)
 
 
 class GraphedStep:
@@ -83,10 +88,13 @@ class GraphedStep:
         return self._result
 
 
-def _update(batch: Batch, loss_of: Loss, trained: torch.nn.Module, optimiser: SOAP) -> torch.Tensor:
+def _update(
+    batch: Batch, loss_of: Loss, trained: torch.nn.Module, optimiser: SOAP, team: Team | None = None
+) -> torch.Tensor:
     optimiser.zero_grad(set_to_none=True)
     loss = loss_of(batch)
     loss.backward()  # type: ignore[no-untyped-call]
+    loss = loss.detach() if team is None else team.join(loss.detach())
     torch.nn.utils.clip_grad_norm_(trained.parameters(), GRADIENT_NORM)
     optimiser.step()
-    return loss.detach()
+    return loss

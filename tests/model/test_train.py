@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import Stage, train
 from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
-from straightpcf.model.train.losses import precision
+from straightpcf.model.train.losses import precision, velocity_loss
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import read_network
+from straightpcf.model.train.team import Team
 from straightpcf.points.errors import InvalidOptions
 from tests.clouds import sphere, torus
 
@@ -202,6 +205,45 @@ def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: P
     joined = weights(run("cvm", "joined", coupled, distance=other))
     theirs = {name: tensor for name, tensor in weights(other).items() if name.startswith("distance_module")}
     assert same(theirs, joined)
+
+
+def test_processes_share_a_batch_and_the_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:
+    losses: list[float] = []
+    path = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=4, threads=1, processes=2, settled=True,
+                 init=velocity_run, on_step=lambda step: losses.append(step.loss))  # fmt: skip
+    assert len(losses) == 3
+    assert all(np.isfinite(losses))
+    before, after = weights(velocity_run), weights(path)
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    assert {"velocity_modules.0.encoder.conv3.lin.weight", "velocity_modules.0.decoder.lin_3.bias"} <= moved
+
+
+def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
+    torch.manual_seed(0)
+    network = StraightPCF(couplings=1).eval()
+    trained = network.velocity_modules
+    loss_of = partial(velocity_loss, rows=64)
+    team = Team(1, network, trained, loss_of, data, 2, (7,))
+    source = PatchSource.read(data)
+    ours = source.draw(np.random.default_rng(8), 2)
+
+    def gradients(batch: Batch) -> tuple[float, list[torch.Tensor]]:
+        trained.zero_grad()
+        (loss := loss_of(network, batch)).backward()
+        return loss.item(), [p.grad.clone() for p in trained.parameters() if p.grad is not None]
+
+    # The member draws with the generator that also gave its dropout seed.
+    rng = np.random.default_rng((7, 1))
+    rng.integers(2**62)
+    theirs_loss, theirs_gradient = gradients(source.draw(rng, 2))
+    ours_loss, ours_gradient = gradients(ours)
+    team.start(training=False)
+    joined = team.join(torch.tensor(ours_loss))
+    team.close()
+    assert joined.item() == pytest.approx((ours_loss + theirs_loss) / 2, rel=1e-5)
+    found = [p.grad for p in trained.parameters() if p.grad is not None]
+    for mean, a, b in zip(found, ours_gradient, theirs_gradient, strict=True):
+        torch.testing.assert_close(mean, (a + b) / 2, rtol=1e-3, atol=1e-6)
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:

@@ -1,0 +1,107 @@
+"""More processes for one training run on CPUs: each takes the gradient of its own patches, at the same weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import multiprocessing
+
+from straightpcf.model.allocator import keep_large_buffers
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.train.data import Batch, PatchSource
+
+__all__ = ["Team"]
+
+NetworkLoss = Callable[[StraightPCF, Batch], torch.Tensor]
+
+
+class Team:
+    """Processes beside the one that updates the weights, which are moved to shared memory.
+
+    seed: each member draws its own patches from [*seed, its number].
+    """
+
+    def __init__(
+        self,
+        members: int,
+        network: StraightPCF,
+        trained: torch.nn.Module,
+        loss: NetworkLoss,
+        data: Path,
+        batch_size: int,
+        seed: tuple[int, ...],
+    ) -> None:
+        network.share_memory()
+        self._parameters = list(trained.parameters())
+        context = multiprocessing.get_context("spawn")
+        self._members: list[tuple[Connection, torch.Tensor]] = []
+        for number in range(1, members + 1):
+            ours, theirs = context.Pipe()
+            gradient = torch.zeros(sum(p.numel() for p in self._parameters))
+            gradient.share_memory_()  # type: ignore[no-untyped-call]
+            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number))
+            context.Process(target=_work, args=arguments, daemon=True).start()
+            theirs.close()
+            self._members.append((ours, gradient))
+
+    def start(self, *, training: bool) -> None:
+        """Set every member to work on its share; do your own meanwhile."""
+        for pipe, _ in self._members:
+            pipe.send(training)
+
+    def join(self, loss: torch.Tensor) -> torch.Tensor:
+        """Average the gradients that the parameters have with those of all members, and the loss with theirs."""
+        share = 1 / (1 + len(self._members))
+        for parameter in self._parameters:
+            if parameter.grad is not None:
+                parameter.grad.mul_(share)
+        loss = loss * share
+        for pipe, gradient in self._members:
+            try:
+                loss = loss + share * pipe.recv()
+            except EOFError:
+                raise RuntimeError("a process that shared the batch has ended; its error is above") from None
+            at = 0
+            for parameter in self._parameters:
+                if parameter.grad is not None:
+                    theirs = gradient[at : at + parameter.numel()]
+                    parameter.grad.add_(theirs.view_as(parameter), alpha=share)
+                at += parameter.numel()
+        return loss
+
+    def close(self) -> None:
+        """Let the members end."""
+        for pipe, _ in self._members:
+            pipe.close()
+
+
+def _work(
+    pipe: Connection,
+    network: StraightPCF,
+    trained: torch.nn.Module,
+    loss_of: NetworkLoss,
+    gradient: torch.Tensor,
+    data: Path,
+    batch_size: int,
+    seed: tuple[int, ...],
+) -> None:
+    torch.set_num_threads(1)
+    keep_large_buffers()
+    rng = np.random.default_rng(seed)
+    torch.manual_seed(int(rng.integers(2**62)))  # dropout
+    source = PatchSource.read(data)
+    try:
+        while True:
+            trained.train(pipe.recv())
+            trained.zero_grad(set_to_none=True)
+            loss = loss_of(network, source.draw(rng, batch_size))
+            loss.backward()  # type: ignore[no-untyped-call]
+            parts = [(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in trained.parameters()]
+            torch.cat(parts, out=gradient)
+            pipe.send(loss.item())
+    except (EOFError, OSError):  # the one who updates the weights has ended
+        return
