@@ -23,6 +23,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling, split
+from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints, TooLarge
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
@@ -34,6 +35,7 @@ EULER_STEPS = 3
 COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RESULTS.md compares)
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
+_TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
 _PROBES = 48  # patches on which "auto" reads the noise
 _CUDA_BATCH = 32
 
@@ -141,6 +143,7 @@ class Filter:
         self.coverage = coverage
         self.euler_steps = euler_steps
         self.full_evaluations = full_evaluations
+        self.turns = turns(_TURNS).to(device)
         self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
         keep_large_buffers()
 
@@ -166,6 +169,7 @@ class Filter:
                     owned=torch.from_numpy(owned[some]).to(x.device),
                     full_evaluations=self.full_evaluations,
                     distance=None if distance is None else distance[some],
+                    turns=self.turns,
                 )
                 displacements = (moved - x[some, :rows]).double().cpu().numpy()
             except torch.OutOfMemoryError as exc:

@@ -68,6 +68,7 @@ class StraightPCF(nn.Module):
         owned: torch.Tensor | None = None,
         full_evaluations: int = 1,
         distance: torch.Tensor | None = None,
+        turns: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
 
@@ -75,18 +76,27 @@ class StraightPCF(nn.Module):
         less, and their distances d (B, 1), those given or else the DistanceModule's. With `owned`, (B,) at most `rows`,
         only so many points of each patch have a velocity of every evaluation: the others, there as neighbours, keep
         that of the last of the first full_evaluations. The flow is straight (section 4.2), so that hardly changes
-        what is seen of them (docs/kernels.md has the figures).
+        what is seen of them (docs/kernels.md has the figures). turns: (T, 3, 3) rotations, one after the other for the
+        evaluations: the network's errors depend on how a patch lies, and those of several positions average out.
         """
         distance = self.distance_module(x) if distance is None else distance
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
         evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
         moving = torch.zeros_like(x)
         inside = None if owned is None else torch.arange(rows or x.shape[1], device=x.device) < owned[:, None]
-        for done, velocity in enumerate(evaluations[:-1]):
+
+        def velocities(number: int, x: torch.Tensor, rows: int | None) -> torch.Tensor:
+            if turns is None:
+                return evaluations[number](x, rows)  # type: ignore[no-any-return]
+            turn = turns[number % len(turns)]
+            return evaluations[number](x @ turn, rows) @ turn.mT  # type: ignore[no-any-return]
+
+        last = len(evaluations) - 1
+        for done in range(last):
             if inside is None or done < full_evaluations:
-                moving = velocity(x)
+                moving = velocities(done, x, None)
             else:
-                fresh = torch.where(inside[:, :, None], velocity(x, rows), moving[:, :rows])
+                fresh = torch.where(inside[:, :, None], velocities(done, x, rows), moving[:, :rows])
                 moving = torch.cat([fresh, moving[:, inside.shape[1] :]], dim=1)
             x = x + step * moving
-        return x[:, :rows] + step * evaluations[-1](x, rows), distance
+        return x[:, :rows] + step * velocities(last, x, rows), distance

@@ -7,6 +7,7 @@ import torch
 from straightpcf.model.nets.edgeconv import EdgeConv
 from straightpcf.model.nets.straightpcf import DistanceModule, StraightPCF, VelocityModule
 from straightpcf.model.ops import knn
+from straightpcf.model.turns import turns
 
 
 def parameters(module: torch.nn.Module) -> int:
@@ -57,6 +58,28 @@ def test_neighbours_may_keep_their_velocity() -> None:
         step = distance[:, :, None] / 2
         here = x + step * first(x)
         torch.testing.assert_close(fewer, here[:, :40] + step * second(here, 40))
+
+
+def test_every_evaluation_sees_the_patch_in_its_own_position() -> None:
+    torch.manual_seed(0)
+    network, x = StraightPCF(width=128, distance_width=128).eval(), torch.randn(2, 300, 3) * 0.2
+    a, b, c = turns(3)
+    with torch.inference_mode():
+        moved, distance = network(x, euler_steps=2, turns=turns(3))
+        step = distance[:, :, None] / 4
+        first, second = network.velocity_modules
+        for velocity, turn in ((first, a), (second, b), (first, c), (second, a)):
+            x = x + step * (velocity(x @ turn) @ turn.T)
+    torch.testing.assert_close(moved, x)
+
+
+def test_turns_are_rotations_and_spread() -> None:
+    matrices = turns(6)
+    torch.testing.assert_close(matrices @ matrices.mT, torch.eye(3).expand(6, 3, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(6))
+    traces = torch.einsum("aij,bij->ab", matrices, matrices)
+    angles = torch.rad2deg(torch.arccos((traces.clamp(max=3.0) - 1) / 2))
+    assert angles[~torch.eye(6, dtype=torch.bool)].min() > 60
 
 
 def test_a_patch_does_not_see_its_batch() -> None:
