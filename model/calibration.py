@@ -20,15 +20,16 @@ class Calibration:
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
     starts: d at the start above which a cloud gets a second, a third, ... pass, as the paper gives 1, 2 and 3.
-    polished: (d at the start, d now): a cloud that was above the first and is below the second gets one pass more. On
-    thin and intricate shapes d stays higher when the noise is gone, and further passes pull their sides together.
+    polish: d at the start above which, while d is below settled, a cloud gets one pass, two, ... more. On thin and
+    intricate shapes d stays higher when the noise is gone, and further passes pull their sides together.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
     starts: tuple[float, ...] = (0.76, 0.905)
-    polished: tuple[float, ...] = (0.45, 0.2)
+    polish: tuple[float, ...] = (0.45,)
+    settled: float = 0.2
     stirred: float = 0.5
     most: int = 4
 
@@ -36,8 +37,6 @@ class Calibration:
         """Refuse tables that cannot be looked up in."""
         if len(self.distances) != len(self.noise) or len(self.noise) < 2 or np.any(np.diff(self.distances) <= 0):
             raise MalformedFile("the calibration's distances must rise and be as many as its noise levels, 2 at least")
-        if len(self.polished) != 2:
-            raise MalformedFile(f"the calibration's polished has {len(self.polished)} numbers; it must have 2")
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Calibration:
@@ -66,7 +65,8 @@ class Calibration:
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
-        polishing = done == due and start > self.polished[0] and now < self.polished[1]
+        polished = due + sum(start > limit for limit in self.polish)
+        polishing = due <= done < polished and now < self.settled
         if done >= self.most or not (done < due or polishing or now > self.stirred):
             return 0
-        return 1 if polishing or done == self.most - 1 else 2
+        return 1 if done == self.most - 1 or (polishing and done == polished - 1) else 2

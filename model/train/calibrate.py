@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +16,16 @@ from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "passes", "trace"]
+__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "passes", "trace"]
 
+# What `calibrate` chooses from: every combination.
+_LIMITS: dict[str, tuple[Any, ...]] = {
+    "starts": tuple(product((0.70, 0.73, 0.76, 0.79), (0.88, 0.895, 0.905, 0.92))),
+    "polish": ((), (0.3,), (0.45,), (0.6,), (0.45, 0.7), (0.45, 0.8), (0.45, 0.9), (0.6, 0.9)),
+    "settled": (0.16, 0.18, 0.2, 0.22, 0.25),
+    "stirred": (0.4, 0.5, 0.6),
+    "most": (4, 5),
+}
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
 
 
@@ -31,7 +42,7 @@ class Trace:
 def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std: float, *, seed: int = 0) -> Trace:
     """Add Gaussian noise of `noise_std` radii to a clean unit-sphere cloud (N, 3) and filter it pass by pass."""
     noisy = clean + noise_std * np.random.default_rng(seed).standard_normal(clean.shape)
-    run = Run(filter_, noisy, DenoiseOptions(iterations=filter_.calibration.most))
+    run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"])))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
@@ -40,16 +51,35 @@ def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std:
 
 
 def calibrate(traces: Sequence[Trace]) -> Calibration:
-    """Read the table of noise levels off recorded traces."""
+    """Read the table of noise levels off recorded traces, and choose the limits of `auto` by replaying them."""
     levels = sorted({t.noise_std for t in traces})
     table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in levels])
-    return Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
+    known = Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
+    choices = [replace(known, **dict(zip(_LIMITS, limits, strict=True))) for limits in product(*_LIMITS.values())]
+    return min(choices, key=lambda choice: loss(choice, traces))
+
+
+def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:
+    """Rate `auto` on recorded traces: the mean log ratio of its CD to that of each cloud's best number of passes.
+
+    Every noise level weighs the same. A cloud that is worse than its input weighs its log ratio to it ten times more.
+    Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5.
+    """
+    by_level: dict[float, list[float]] = {}
+    for t in traces:
+        reached = t.chamfer[passes(calibration, t)]
+        if t.chamfer[0] > 0:
+            rating = math.log(reached / min(t.chamfer[1:])) + 10 * max(0.0, math.log(reached / t.chamfer[0]))
+        else:
+            rating = reached / 1e-5
+        by_level.setdefault(t.noise_std, []).append(rating)
+    return float(np.mean([np.mean(ratings) for ratings in by_level.values()]))
 
 
 def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
-    while calibration.passes_left(recorded.distances[: done + 1]):
+    while done + 1 < len(recorded.distances) and calibration.passes_left(recorded.distances[: done + 1]):
         done += 1
     return done
 

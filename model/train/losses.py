@@ -32,10 +32,12 @@ def velocity_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor
 
 
 def coupled_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
-    """L_B: every module's velocity, plus lambda_1 times where each but the last leaves the points (stage 2).
+    """L_B: every module's velocity, plus lambda_1 times where it leaves the points (stage 2).
 
     Module k starts where module k - 1 left the points, at time t + k (1 - t) / K; the last module's
-    error is taken on the first `rows` points only.
+    errors are taken on the first `rows` points only. The paper leaves out where the last module leaves the points: then
+    it learns to go on straight, also from where the first has gone wrong, and the stack ends farther from
+    the surface than two copies of a single module do (docs/training.md).
     """
     couplings = len(network.velocity_modules)
     target = batch.clean - batch.noisy
@@ -44,12 +46,12 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
     step = (1 - batch.time) / couplings
     loss = x.new_zeros(())
     for k, velocity in enumerate(network.velocity_modules, start=1):
-        last = k == couplings
-        v = velocity(x, rows if last else None)
-        loss = loss + _weighted(v - target[:, : v.shape[1]], weight[:, : v.shape[1]])
-        if not last:
-            x = x + step * v
-            loss = loss + LAMBDA_1 * _weighted(x - batch.at(batch.time + k * step), weight)
+        v = velocity(x, rows if k == couplings else None)
+        some = slice(v.shape[1])
+        x = x[:, some] + step * v
+        there = batch.at(batch.time + k * step)[:, some]
+        loss = loss + _weighted(v - target[:, some], weight[:, some])
+        loss = loss + LAMBDA_1 * _weighted(x - there, weight[:, some])
     return loss
 
 

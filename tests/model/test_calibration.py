@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from straightpcf.model.calibration import Calibration
-from straightpcf.model.train.calibrate import Trace, calibrate, passes
+from straightpcf.model.train.calibrate import Trace, calibrate, loss, passes
 from straightpcf.points.errors import MalformedFile
 
 
 def trace(noise_std: float, *distances: float) -> Trace:
-    return Trace("cloud", noise_std, distances, (1.0,) * 5)
+    return Trace("cloud", noise_std, distances, (1.0,) * len(distances))
 
 
 def test_the_table_of_noise_levels_is_read_off_traces() -> None:
-    recorded = [trace(std, d) for std, d in ((0.0, 0.1), (0.01, 0.5), (0.01, 0.7), (0.01, 0.6), (0.02, 0.9))]
+    recorded = [trace(std, d, d) for std, d in ((0.0, 0.1), (0.01, 0.5), (0.01, 0.7), (0.01, 0.6), (0.02, 0.9))]
     calibration = calibrate(recorded)
     assert calibration.noise_std(np.array([0.0, 0.1, 0.6, 0.75, 1.0])) == pytest.approx([0, 0, 0.01, 0.015, 0.02])
 
@@ -38,9 +38,28 @@ def test_a_cloud_gets_the_passes_that_its_distances_ask_for(distances: tuple[flo
     assert passes(Calibration(), trace(0.0, *distances)) == made
 
 
+def test_the_limits_are_those_under_which_recorded_clouds_end_best() -> None:
+    smooth = [  # four passes are best, one more does harm
+        Trace("smooth", 0.02, (0.87, 0.24, 0.15, 0.13, 0.12, 0.11), (9.0, 4.0, 3.0, 2.5, 2.0, 2.2)),
+        Trace("smooth", 0.01, (0.58, 0.14, 0.12, 0.12, 0.11, 0.11), (5.0, 2.1, 2.0, 2.1, 2.2, 2.3)),
+    ]
+    intricate = [Trace("thin", 0.01, (0.71, 0.30, 0.24, 0.19, 0.16, 0.15), (5.0, 4.0, 6.0, 7.0, 8.0, 9.0))]
+    fitted = calibrate([*smooth, *intricate])
+    assert [passes(fitted, t) for t in smooth + intricate] == [4, 2, 1]
+    assert loss(fitted, smooth + intricate) == pytest.approx(0)
+    assert loss(Calibration(), smooth + intricate) > 0
+
+
+def test_a_pass_that_makes_a_cloud_worse_than_its_input_costs_most() -> None:
+    worse = Trace("thin", 0.01, (0.6, 0.15, 0.1, 0.1, 0.1, 0.1), (5.0, 4.9, 5.5, 6.0, 6.0, 6.0))
+    others = Trace("smooth", 0.01, (0.6, 0.15, 0.1, 0.1, 0.1, 0.1), (9.0, 5.0, 4.5, 4.5, 4.5, 4.5))
+    assert passes(calibrate([others]), others) == 2
+    assert passes(calibrate([others, worse]), worse) == 1
+
+
 def test_a_calibration_survives_its_metadata_and_a_broken_one_is_refused() -> None:
-    calibration = calibrate([trace(0.0, 0.1), trace(0.01, 0.6)])
+    calibration = calibrate([trace(0.0, 0.1, 0.1), trace(0.01, 0.6, 0.1)])
     assert Calibration.from_metadata(calibration.to_metadata()) == calibration
-    for broken in ({"polished": [1.0]}, {"distances": [0.5, 0.4], "noise": [0.0, 0.1]}, {"settled": 0.1}, 7):
+    for broken in ({"polished": 0.2}, {"distances": [0.5, 0.4], "noise": [0.0, 0.1]}, {"limits": [0.1]}, 7):
         with pytest.raises(MalformedFile):
             Calibration.from_metadata({"calibration": broken})
