@@ -27,7 +27,8 @@ from straightpcf.model.train.state import read_network
 def main() -> None:
     """Print both tables; with --out write the weights."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3")
+    parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3, or 2")
+    parser.add_argument("--distance", type=Path, help="a state whose DistanceModule to take instead")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
@@ -39,6 +40,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     network, progress = read_network(arguments.state)
+    if arguments.distance is not None:
+        network.distance_module.load_state_dict(read_network(arguments.distance)[0].distance_module.state_dict())
     clouds = _clouds(arguments.data, arguments.clouds)
     traces = _traces(Filter(network, threads=arguments.threads), clouds, arguments.noise, arguments.traces)
     calibration = calibrate(traces)

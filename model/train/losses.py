@@ -1,8 +1,8 @@
 """The three objectives of the paper, errors of velocities and places weighted by what the noise leaves knowable.
 
-Along the surface nobody can tell where a noisy point came from: two thirds of |v - (y - x_0)|^2 are that noise, nearly
-all of its gradient's variance, and no network removes them. So errors are weighted as in generalised least squares
-(Aitken 1936), by the inverse of the target's covariance given the clean points around (`precision`).
+Along a surface it can hardly be told where a noisy point came from: two thirds of |v - (y - x_0)|^2 are that noise, and
+nearly all of its gradient's variance. So errors are weighted as in generalised least squares (Aitken 1936), by the
+inverse of the target's covariance given the clean points around (`precision`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ LAMBDA_1 = 10.0
 LAMBDA_2 = 200.0
 _TRAJECTORIES = 0.25  # the share of a batch that L_C moves
 _UNIT = 3 * NOISE_STD**2  # the mean of |y - x_0|^2
-# Spread of the target, in units of the noise at time t, below which an error counts in full.
-_KNOWABLE = 0.3
+# Spread of the target, in units of the noise at time t, at which an error counts by half.
+_KNOWABLE = 1.0
 _LATEST = 0.9  # the noise at time t is taken as no less than at this one: float32 covariances bear no less
 
 
@@ -60,10 +60,10 @@ def precision(batch: Batch, rows: int) -> torch.Tensor:
     """Weigh the errors of the first `rows` points of each patch: (B, rows, 3, 3), symmetric, eigenvalues in (0, 1].
 
     s^2 (C + s^2 I)^-1, where C is the covariance of the clean points that x_t may have come from, each as likely as
-    the noise at time t makes it, and s is 0.3 of that noise: about 1 across a surface, 1/12 along it, and 1 throughout
-    where the noise is smaller than the distance between points. It depends on x_t and the clean points, not on which of
-    them is the target: the velocity of least weighted error is still a mean of y - x_0, in which clean clouds that tell
-    more of it count for more.
+    the noise at time t makes it, and s is that noise: about 1 across a surface, 1/2 along it, and 1 throughout where
+    the noise is smaller than the distance between points. It depends on x_t and the clean points, not on which of
+    them is the target: the velocity of least weighted error is still a mean of y - x_0, in which clean clouds that
+    tell more of it count for more.
     """
     x = batch.at(batch.time)[:, :rows]
     noise = NOISE_STD * (1 - batch.time).clamp(min=1 - _LATEST)
