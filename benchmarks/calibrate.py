@@ -21,7 +21,7 @@ from straightpcf.model.checkpoint import save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, passes, trace
-from straightpcf.model.train.state import read_network
+from straightpcf.model.train.state import read_network, take_distance_module
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
 
     network, progress = read_network(arguments.state)
     if arguments.distance is not None:
-        network.distance_module.load_state_dict(read_network(arguments.distance)[0].distance_module.state_dict())
+        take_distance_module(network, arguments.distance)
     clouds = _clouds(arguments.data, arguments.clouds)
     traces = _traces(Filter(network, threads=arguments.threads), clouds, arguments.noise, arguments.traces)
     calibration = calibrate(traces)

@@ -20,7 +20,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
 from straightpcf.model.train.soap import SOAP
-from straightpcf.model.train.state import Average, load_state, read_network, save_state
+from straightpcf.model.train.state import Average, load_state, read_network, save_state, take_distance_module
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
 from straightpcf.model.train.team import Team
 from straightpcf.points.errors import InvalidOptions
@@ -94,7 +94,7 @@ def train(
     resuming = state_path.exists()
     network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
     if distance is not None and not resuming:
-        network.distance_module.load_state_dict(read_network(distance)[0].distance_module.state_dict())
+        take_distance_module(network, distance)
     trained = _trained_part(stage, network)
     optimiser = SOAP(trained.parameters())
     average = Average(network, _EMA_DECAY)

@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Average", "load_state", "read_network", "save_state"]
+__all__ = ["Average", "load_state", "read_network", "save_state", "take_distance_module"]
 
 
 class Average:
@@ -85,6 +85,11 @@ def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
     network = StraightPCF(couplings=couplings)
     network.load_state_dict(average)
     return network, dict(json.loads(metadata["progress"]))
+
+
+def take_distance_module(network: StraightPCF, path: Path) -> None:
+    """Give a network the averaged DistanceModule of a run's state."""
+    network.distance_module.load_state_dict(read_network(path)[0].distance_module.state_dict())
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
