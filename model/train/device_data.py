@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from straightpcf.model.train.data import (
@@ -11,27 +13,30 @@ from straightpcf.model.train.data import (
     NOISE_STD,
     PATCH_SIZE,
     SCALES,
+    TOUCH_UNTIL,
     Batch,
     PatchSource,
 )
 
 __all__ = ["DevicePatchSource", "random_rotations"]
 
+_NEAR_SURFACE = 5 * CANDIDATES  # the finest clouds have five times the points of the coarsest
+
 
 class DevicePatchSource:
     """Draw what `PatchSource` draws, with the device's default generator.
 
     Clouds of different size share one (C, N, 3) tensor; the places that a cloud does not fill are infinitely far.
-    A draw costs B N distances, which a GPU does not notice and a CPU does: there, use `PatchSource`.
+    A draw costs B N distances and as many to the surfaces, which a GPU does not notice and a CPU does: there, use
+    `PatchSource`.
     """
 
     def __init__(self, source: PatchSource, device: torch.device) -> None:
         self._counts = torch.tensor([len(cloud) for cloud in source.clouds], device=device)
         self._candidates = min([CANDIDATES, *map(len, source.clouds)])
-        shape = (len(source.clouds), int(self._counts.max()), 3)
-        self._clouds = torch.full(shape, torch.inf, dtype=torch.float32, device=device)
-        for padded, cloud in zip(self._clouds, source.clouds, strict=True):
-            padded[: len(cloud)] = torch.from_numpy(cloud).to(padded)
+        self._clouds = _padded(source.clouds, device)
+        self._surfaces = _padded([surface.xyz for surface in source.surfaces], device)
+        self._normals = _padded([surface.normals for surface in source.surfaces], device)
 
     def draw(self, batch_size: int) -> Batch:
         """Draw an augmented batch of `batch_size` patches."""
@@ -51,13 +56,21 @@ class DevicePatchSource:
         turn = torch.empty(batch_size, PATCH_SIZE, device=device).exponential_()
         turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
         inside = inside.gather(1, turn.argsort(dim=1))
+        here, clean = here.gather(1, _rows(inside)), clean.gather(1, _rows(inside))
+        clean = torch.where(time < TOUCH_UNTIL, self.touching(which, here, clean), clean)
+        noisy = torch.lerp(clean, here, 1 / (1 - time))
         scale = torch.empty(batch_size, 1, 1, device=device).uniform_(*SCALES)
         transform = random_rotations(batch_size, device) * scale
-        return Batch(
-            (noisy.gather(1, _rows(inside)) - origin) @ transform,
-            (clean.gather(1, _rows(inside)) - origin) @ transform,
-            time,
-        )
+        return Batch((noisy - origin) @ transform, (clean - origin) @ transform, time)
+
+    def touching(self, which: torch.Tensor, here: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
+        """Do for (B, P, 3) points of the clouds numbered `which` (B,) what `Surface.touching` does."""
+        surface, normals = self._surfaces[which], self._normals[which]  # (B, M, 3)
+        squared = (surface - here.mean(dim=1, keepdim=True)).square().sum(dim=2)
+        near = squared.topk(min(_NEAR_SURFACE, surface.shape[1]), dim=1, largest=False).indices
+        near = near.gather(1, torch.cdist(here, surface.gather(1, _rows(near))).argmin(dim=2))  # (B, P)
+        foot, normal = surface.gather(1, _rows(near)), normals.gather(1, _rows(near))
+        return clean + ((foot - clean) * normal).sum(dim=2, keepdim=True) * normal
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:
@@ -69,6 +82,13 @@ def random_rotations(count: int, device: torch.device) -> torch.Tensor:
         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, dim=1).view(count, 3, 3)
+
+
+def _padded(clouds: list[npt.NDArray[np.float64]], device: torch.device) -> torch.Tensor:
+    out = torch.full((len(clouds), max(map(len, clouds)), 3), torch.inf, dtype=torch.float32, device=device)
+    for padded, cloud in zip(out, clouds, strict=True):
+        padded[: len(cloud)] = torch.from_numpy(cloud).to(padded)
+    return out
 
 
 def _rows(index: torch.Tensor) -> torch.Tensor:

@@ -22,7 +22,7 @@ from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import Average, load_state, read_network, save_state, take_distance_module
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
-from straightpcf.model.train.team import Team
+from straightpcf.model.train.team import NetworkLoss, Team
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
@@ -67,6 +67,8 @@ def train(
     init: Path | None = None,
     distance: Path | None = None,
     settled: bool = False,
+    euler_steps: int = 1,
+    carried: Path | None = None,
     on_step: Callable[[TrainStep], None] | None = None,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
@@ -76,12 +78,15 @@ def train(
     dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
     up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
     another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each batch, one thread
-    each; batch_size must be a multiple.
+    each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on (`coupled_loss`). carried:
+    clouds after a pass, which `carry` wrote: stage cvm is trained on those as well, on a CPU.
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
     and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
+    if carried is not None and (stage != "cvm" or device != "cpu"):
+        raise InvalidOptions("carried clouds are for stage cvm on a CPU")
     if threads is not None:
         torch.set_num_threads(threads)
     keep_large_buffers()
@@ -100,12 +105,16 @@ def train(
     average = Average(network, _EMA_DECAY)
     start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
-    source = PatchSource.read(data)
-    loss_of = partial(_LOSSES[stage], network, rows=rows)
+    read = partial(PatchSource.read, data, carried=carried)
+    source = read()
+    stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
+    if stage == "cvm":
+        stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
+    loss_of = partial(stage_loss, network)
     share = batch_size // processes
     team = None
     if processes > 1:
-        team = Team(processes - 1, network, trained, partial(_LOSSES[stage], rows=rows), data, share, (seed, start))
+        team = Team(processes - 1, network, trained, stage_loss, read, share, (seed, start))
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"
@@ -135,7 +144,7 @@ def train(
                     raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
                 recent_loss = recent[-1]
             if iteration % _VALIDATE_EVERY == 0 or last:
-                validation = _validate(stage, network, average, fixed.to(place), rows)
+                validation = _validate(stage_loss, network, average, fixed.to(place))
                 progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
                             "learning_rate": learning_rate, "validation": validation}  # fmt: skip
                 save_state(state_path, network, average, optimiser, rng, progress)
@@ -187,9 +196,9 @@ def _learning_rate(peak: float, iteration: int, iterations: int) -> float:
 
 
 @torch.no_grad()
-def _validate(stage: Stage, network: StraightPCF, average: Average, fixed: Batch, rows: int) -> float:
+def _validate(loss: NetworkLoss, network: StraightPCF, average: Average, fixed: Batch) -> float:
     averaged = copy.deepcopy(network)
     averaged.load_state_dict(average.tensors)
     averaged.eval()
     parts = zip(*(tensor.chunk(8) for tensor in (fixed.noisy, fixed.clean, fixed.time)), strict=True)
-    return round(float(np.mean([_LOSSES[stage](averaged, Batch(*part), rows).item() for part in parts])), 5)
+    return round(float(np.mean([loss(averaged, Batch(*part)).item() for part in parts])), 5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 
-__all__ = ["Team"]
+__all__ = ["NetworkLoss", "Team"]
 
 NetworkLoss = Callable[[StraightPCF, Batch], torch.Tensor]
 
@@ -31,7 +30,7 @@ class Team:
         network: StraightPCF,
         trained: torch.nn.Module,
         loss: NetworkLoss,
-        data: Path,
+        source: Callable[[], PatchSource],
         batch_size: int,
         seed: tuple[int, ...],
     ) -> None:
@@ -43,7 +42,7 @@ class Team:
             ours, theirs = context.Pipe()
             gradient = torch.zeros(sum(p.numel() for p in self._parameters))
             gradient.share_memory_()  # type: ignore[no-untyped-call]
-            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number))
+            arguments = (theirs, network, trained, loss, gradient, source, batch_size, (*seed, number))
             context.Process(target=_work, args=arguments, daemon=True).start()
             theirs.close()
             self._members.append((ours, gradient))
@@ -85,7 +84,7 @@ def _work(
     trained: torch.nn.Module,
     loss_of: NetworkLoss,
     gradient: torch.Tensor,
-    data: Path,
+    read: Callable[[], PatchSource],
     batch_size: int,
     seed: tuple[int, ...],
 ) -> None:
@@ -93,7 +92,7 @@ def _work(
     keep_large_buffers()
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**62)))  # dropout
-    source = PatchSource.read(data)
+    source = read()
     try:
         while True:
             trained.train(pipe.recv())

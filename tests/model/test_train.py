@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import Stage, train
-from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource
+from straightpcf.model.train.carry import carry
+from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource, held_out_shapes
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
-from straightpcf.model.train.losses import precision, velocity_loss
+from straightpcf.model.train.losses import coupled_loss, precision, velocity_loss
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import read_network
 from straightpcf.model.train.team import Team
+from straightpcf.model.turns import turns
 from straightpcf.points.errors import InvalidOptions
 from tests.clouds import sphere, torus
 
@@ -75,7 +78,7 @@ def test_patches_drawn_on_the_device_are_like_those_drawn_on_the_host(data: Path
 def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
     # A patch of a plane cut at x_t is a disc: 0.81 of its points lie within 0.9 of its radius, however late t is.
     plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
-    source = PatchSource([plane])
+    source = PatchSource([[plane]])
     torch.manual_seed(0)
     device = torch.device("cpu")
     batch = DevicePatchSource(source, device).draw(64) if on_device else source.draw(np.random.default_rng(0), 64)
@@ -83,6 +86,24 @@ def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
     within = (reach < 0.9 * reach.amax(dim=1, keepdim=True)).float().mean(dim=1)
     late = batch.time.flatten() > 0.7
     assert within[late].mean() == pytest.approx(0.81, abs=0.02)
+
+
+def test_noisy_points_are_led_to_the_surface_and_not_beneath_it() -> None:
+    noise, rng = 0.02, np.random.default_rng(0)
+    ball = sphere(20_000, 0)
+    clean = ball[np.linalg.norm(ball - ball[0], axis=1).argsort()[:PATCH_SIZE]]
+    here = clean + noise * rng.standard_normal(clean.shape)
+    source = PatchSource([[ball.astype(np.float32)]])
+    out = here / np.linalg.norm(here, axis=1, keepdims=True)
+    chosen = source.surfaces[0].touching(here, clean)
+    assert (((chosen - clean) ** 2).sum(axis=1) > 0).any()
+    beneath = 1 - (clean * out).sum(axis=1)
+    assert beneath.mean() == pytest.approx(noise**2, rel=0.1)  # H s^2
+    assert abs((1 - (chosen * out).sum(axis=1)).mean()) < 0.1 * noise**2
+    on_device = DevicePatchSource(source, torch.device("cpu"))
+    wide = (torch.from_numpy(part).float()[None] for part in (here, clean))
+    theirs = on_device.touching(torch.zeros(1, dtype=torch.long), *wide)
+    assert np.abs(theirs[0].numpy() - chosen).max() < 1e-5
 
 
 @pytest.mark.parametrize("on_device", [False, True])
@@ -223,7 +244,7 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
     network = StraightPCF(couplings=1).eval()
     trained = network.velocity_modules
     loss_of = partial(velocity_loss, rows=64)
-    team = Team(1, network, trained, loss_of, data, 2, (7,))
+    team = Team(1, network, trained, loss_of, partial(PatchSource.read, data), 2, (7,))
     source = PatchSource.read(data)
     ours = source.draw(np.random.default_rng(8), 2)
 
@@ -244,6 +265,69 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
     found = [p.grad for p in trained.parameters() if p.grad is not None]
     for mean, a, b in zip(found, ours_gradient, theirs_gradient, strict=True):
         torch.testing.assert_close(mean, (a + b) / 2, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("euler_steps", [1, 3])
+def test_the_coupled_loss_takes_the_pass_that_the_filter_takes(data: Path, euler_steps: int) -> None:
+    torch.manual_seed(0)
+    network = StraightPCF(couplings=2).eval()
+    batch = PatchSource.read(data).draw(np.random.default_rng(0), 2)
+    seen: list[torch.Tensor] = []
+    for module in network.velocity_modules:
+        module.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    rows, count = 64, 2 * euler_steps
+    with torch.no_grad():
+        loss = coupled_loss(network, batch, rows, euler_steps)
+        trained, seen[:] = seen[:], []
+        network(batch.at(batch.time), euler_steps=euler_steps, rows=rows, owned=torch.tensor([rows, rows]),
+                distance=1 - batch.time[:, :, 0], turns=turns(count))  # fmt: skip
+    assert torch.isfinite(loss)
+    assert len(trained) == len(seen) == count
+    for ours, theirs in zip(trained, seen, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+@pytest.fixture(scope="module")
+def carried(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("carried") / "carried.npz"
+    network = StraightPCF()
+    for module in network.velocity_modules:
+        module.start_slow()
+    assert carry(Filter(network, threads=1), data, path, noise_stds=[0.01, 0.02], points=[2000]) == 20
+    return path
+
+
+def test_carried_clouds_are_those_of_training_after_a_pass(data: Path, carried: Path) -> None:
+    with np.load(data) as clean, np.load(carried) as after:
+        for name in after.files:
+            cloud, number = name.rsplit("/", 1)
+            assert cloud.split("/")[0] not in held_out_shapes(clean.files)
+            assert after[name].dtype == np.float32
+            left = np.linalg.norm(after[name] - clean[cloud], axis=1)
+            assert 0.5 < left.mean() / (0.016 * (1 + int(number))) < 3  # an untrained network moves little
+
+
+def test_a_coupled_stack_trains_on_carried_clouds(
+    data: Path, carried: Path, tmp_path: Path, velocity_run: Path
+) -> None:
+    source = PatchSource.read(data, carried=carried)
+    batch = source.draw(np.random.default_rng(0), 16)
+    after = batch.time.isnan().flatten()
+    assert 4 <= after.sum() <= 12
+    assert (batch.noisy[after].norm(dim=2).amin(dim=1) < 1e-5).all()
+    torch.manual_seed(0)
+    network = StraightPCF(couplings=2).eval()
+    starts: list[torch.Tensor] = []
+    network.velocity_modules[0].register_forward_pre_hook(lambda _, inputs: starts.append(inputs[0]))
+    with torch.no_grad():
+        assert torch.isfinite(coupled_loss(network, batch, 64))
+    torch.testing.assert_close(starts[0][after], batch.noisy[after] @ turns(2)[0], rtol=1e-4, atol=1e-5)
+    path = train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=4, threads=1, processes=2,
+                 init=velocity_run, carried=carried)  # fmt: skip
+    assert read_network(path)[1]["iteration"] == 1
+    with pytest.raises(InvalidOptions, match="carried"):
+        train("vm", data=data, run_dir=tmp_path / "vm", iterations=1, carried=carried)
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
