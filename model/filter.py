@@ -22,6 +22,7 @@ from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
 from straightpcf.model.patches import Patches
+from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints, TooLarge
@@ -36,6 +37,7 @@ COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RE
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
+_EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 _PROBES = 48  # patches on which "auto" reads the noise
 _CUDA_BATCH = 32
 
@@ -125,11 +127,13 @@ class Filter:
         coverage: float = COVERAGE,
         euler_steps: int = EULER_STEPS,
         full_evaluations: int = FULL_EVALUATIONS,
+        even: bool = True,
         batch: int | None = None,
         tile_points: int | None = None,
     ) -> None:
         """Put a network between the stages.
 
+        even: between passes, points are spread along the surface (`spread`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """
@@ -143,6 +147,7 @@ class Filter:
         self.coverage = coverage
         self.euler_steps = euler_steps
         self.full_evaluations = full_evaluations
+        self.even = even
         self.turns = turns(_TURNS).to(device)
         self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
         keep_large_buffers()
@@ -238,6 +243,8 @@ class Run:
             while True:
                 here = self.frame.enter(self.points.xyz)
                 here += self.moved
+                evened = self._evened(here, planned)
+                here += evened
                 tiling = Tiling(
                     here, tiles, coverage=self.filter.coverage, seed=self.options.seed, device=self.filter.device
                 )
@@ -248,6 +255,7 @@ class Run:
                 if left == 0:
                     return
                 self.iterations += 1
+                self.moved += evened
                 yield from self._pass(here, tiling, pool, left)
 
     def result(self, seconds: float) -> DenoiseResult:
@@ -267,6 +275,15 @@ class Run:
         if planned is not None:
             return planned - self.iterations
         return self.filter.calibration.passes_left(self.distances)
+
+    def _evened(self, here: npt.NDArray[np.float64], planned: int | None) -> npt.NDArray[np.float64] | float:
+        """Return how points go along the surface before the pass that comes, (N, 3); not before the first.
+
+        Nor in a scene: scan lines are no clumps.
+        """
+        if not self.filter.even or self.iterations in (0, planned) or self.scene:
+            return 0.0
+        return spread(here, _EVENED * self.noise[0], workers=self.filter.threads)
 
     def _pass(
         self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor, left: int

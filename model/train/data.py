@@ -48,7 +48,7 @@ NEAR_SHARE, NEAR_WEIGHT = 0.5, 9.0
 
 # Until then what is across the surface is aimed at the surface itself; later it is known no better than the points are.
 TOUCH_UNTIL = 0.98
-_CARRIED_SHARE = 0.5  # of the patches of a cloud that has carried versions
+_CARRIED_SHARE = 0.75  # of the patches of a cloud that has carried versions
 
 
 @dataclass(frozen=True)
