@@ -248,9 +248,6 @@ def train(
     init: Annotated[Path | None, typer.Option(help="The state to start from.")] = None,
     distance: Annotated[Path | None, typer.Option(help="A state whose DistanceModule to start from instead.")] = None,
     settled: Annotated[bool, typer.Option("--settled", help="No dropout, BatchNorm as it is: to train on.")] = False,
-    carried: Annotated[
-        Path | None, typer.Option(help="Clouds after a pass (`carry`), for cvm to train on too.")
-    ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after these, with the state saved.")] = None,
 ) -> None:
     """Train one stage; resumable, logged as CSV."""
@@ -275,35 +272,9 @@ def train(
             init=init,
             distance=distance,
             settled=settled,
-            carried=carried,
             minutes=minutes,
             on_step=lambda step: show(step.iteration / step.iterations, f"loss {step.loss:.3e}"),
         )
-
-
-@app.command()
-def carry(
-    out: Annotated[Path, typer.Argument(help="An NPZ for `train --carried`.")],
-    data: Annotated[Path, typer.Option(help="Clean clouds, one NPZ.")],
-    state: Annotated[
-        Path | None, typer.Option(help="The run whose network to take instead of the shipped one.")
-    ] = None,
-    noise_std: Annotated[list[float] | None, typer.Option(help="In radii; may be repeated (0.01, 0.02).")] = None,
-    points: Annotated[list[int] | None, typer.Option(help="Of the clouds to take; may be repeated (10000).")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
-) -> None:
-    """Make training clouds of what a first pass leaves, which is what later passes see."""
-    with needs("train"):
-        from straightpcf.model.filter import Filter, load_filter
-        from straightpcf.model.train.carry import carry as run_carry
-        from straightpcf.model.train.state import read_network
-
-    owner = load_filter(threads=threads) if state is None else Filter(read_network(state)[0], threads=threads)
-    with progress_bar("filtering training clouds") as show:
-        count = run_carry(owner, data, out, noise_stds=noise_std or (0.01, 0.02), points=points or (10_000,), seed=seed,
-                          on_progress=show)  # fmt: skip
-    typer.echo(f"{out}: {count} clouds")
 
 
 @app.command()

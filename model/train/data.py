@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,20 +43,17 @@ CANDIDATES = 2600
 # The filter keeps of a patch what lies near its seed (a third, at 3-fold coverage): of the points that come first in a
 # batch, and so into the loss, nine of ten are of the nearer half.
 NEAR_SHARE, NEAR_WEIGHT = 0.5, 9.0
-
-
 # Until then what is across the surface is aimed at the surface itself; later it is known no better than the points are.
 TOUCH_UNTIL = 0.98
-_CARRIED_SHARE = 0.75  # of the patches of a cloud that has carried versions
 
 
 @dataclass(frozen=True)
 class Batch:
     """B patches, in the frame of the seed's noisy position at time t, points near the seed likely to come first.
 
-    noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [0, 1); or NaN for a carried
-    patch, of a cloud that has been through a pass already: noisy is then where that left the points, and what time it
-    is, is for the DistanceModule to say.
+    noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [0, 1). Across the surface y is
+    on the plane that touches it where x_t is nearest (`Surface.touching`), and x_0 on the line
+    from there through x_t.
     """
 
     noisy: torch.Tensor
@@ -107,53 +103,33 @@ def held_out_shapes(names: Iterable[str]) -> set[str]:
 class PatchSource:
     """Draw patches from clean clouds, each in the frame where its bounding sphere has radius 1."""
 
-    def __init__(
-        self,
-        shapes: list[list[npt.NDArray[np.float32]]],
-        carried: list[list[list[npt.NDArray[np.float32]]]] | None = None,
-    ) -> None:
-        """Take the clouds of each shape, in one frame; the one of most points is taken for its surface.
-
-        carried: for each of the clouds, any number of versions of it after noise and a pass of the filter, in its frame
-        and order; where there are some, they are drawn from as often as fresh noise.
-        """
+    def __init__(self, shapes: list[list[npt.NDArray[np.float32]]]) -> None:
+        """Take the clouds of each shape, in one frame; the one of most points is taken for its surface."""
         if not shapes:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
         self.clouds: list[npt.NDArray[np.float64]] = []
         self.surfaces: list[Surface] = []
-        self._carried: list[list[cKDTree]] = []
-        for number, shape in enumerate(shapes):
+        for shape in shapes:
             finest = max(shape, key=len).astype(np.float64)
             normals = recompute_normals(finest, np.zeros_like(finest))
-            versions = [[] for _ in shape] if carried is None else carried[number]
-            for cloud, after in zip(shape, versions, strict=True):
+            for cloud in shape:
                 wide = cloud.astype(np.float64)
                 frame = CloudFrame.of(wide)
-                self._carried.append([cKDTree(frame.enter(xyz.astype(np.float64))) for xyz in after])
                 self.clouds.append(frame.enter(wide))
                 self.surfaces.append(Surface(frame.enter(finest), normals))
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
 
     @classmethod
-    def read(cls, path: Path, *, validation: bool = False, carried: Path | None = None) -> PatchSource:
-        """Read an .npz of clean clouds named `<shape>/<resolution>`: the training shapes, or the held-out ones.
-
-        carried: an .npz that `carry` wrote, of the same clouds named `<shape>/<resolution>/<number>`.
-        """
-        after: dict[str, list[npt.NDArray[np.float32]]] = {}
-        if carried is not None:
-            with np.load(carried, allow_pickle=False) as archive:
-                for name in archive.files:
-                    after.setdefault(name.rpartition("/")[0], []).append(archive[name])
+    def read(cls, path: Path, *, validation: bool = False) -> PatchSource:
+        """Read an .npz of clean clouds named `<shape>/<resolution>`: the training shapes, or the held-out ones."""
         with np.load(path, allow_pickle=False) as archive:
             held_out = held_out_shapes(archive.files)
-            shapes: dict[str, list[str]] = {}
+            shapes: dict[str, list[npt.NDArray[np.float32]]] = {}
             for name in archive.files:
                 shape = name.split("/")[0]
                 if (shape in held_out) == validation:
-                    shapes.setdefault(shape, []).append(name)
-            clouds = [[archive[name] for name in names] for names in shapes.values()]
-            return cls(clouds, [[after.get(name, []) for name in names] for names in shapes.values()])
+                    shapes.setdefault(shape, []).append(archive[name])
+            return cls(list(shapes.values()))
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""
@@ -163,44 +139,25 @@ class PatchSource:
 
     def _patch(self, rng: np.random.Generator, *, augment: bool) -> tuple[npt.NDArray[np.float64], ...]:
         which = int(rng.integers(len(self.clouds)))
-        carried = self._carried[which]
-        if carried and rng.random() < _CARRIED_SHARE:
-            here, clean = self._after_a_pass(rng, which, carried[rng.integers(len(carried))])
-            time = math.nan
-        else:
-            here, clean, time = self._fresh(rng, which)
+        cloud, tree = self.clouds[which], self._trees[which]
+        seed = cloud[rng.integers(len(cloud))]
+        _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
+        clean = cloud[near]  # row 0 is the seed
+        time = rng.random()
+        here = clean + (1 - time) * NOISE_STD * rng.standard_normal(clean.shape)
         origin = here[0]
+        # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
+        distance = np.square(here - origin).sum(axis=1)
+        inside = np.argsort(distance)[:PATCH_SIZE]
         transform = np.eye(3)
         if augment:
             transform = Rotation.random(random_state=rng).as_matrix() * rng.uniform(*SCALES)
         # A weighted draw without replacement: the smallest of exponential variables (Efraimidis and Spirakis 2006).
         turn = rng.exponential(size=PATCH_SIZE)
         turn[: int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
-        order = np.argsort(turn)
-        here, clean = here[order], clean[order]
-        if not time >= TOUCH_UNTIL:
+        inside = inside[np.argsort(turn)]
+        here, clean = here[inside], clean[inside]
+        if time < TOUCH_UNTIL:
             clean = self.surfaces[which].touching(here, clean)
-        noisy = here if math.isnan(time) else (here - time * clean) / (1 - time)
+        noisy = (here - time * clean) / (1 - time)
         return (noisy - origin) @ transform, (clean - origin) @ transform, np.array(time)
-
-    def _fresh(
-        self, rng: np.random.Generator, which: int
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
-        """Return a patch at x_t, nearest to its seed first, its clean points, and t."""
-        cloud, tree = self.clouds[which], self._trees[which]
-        seed = cloud[rng.integers(len(cloud))]
-        _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
-        clean = cloud[near]  # row 0 is the seed
-        noisy = clean + NOISE_STD * rng.standard_normal(clean.shape)
-        time = rng.random()
-        here = (1 - time) * noisy + time * clean
-        # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
-        inside = np.argsort(np.square(here - here[0]).sum(axis=1))[:PATCH_SIZE]
-        return here[inside], clean[inside], time
-
-    def _after_a_pass(
-        self, rng: np.random.Generator, which: int, tree: cKDTree
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return a patch of a carried cloud, nearest to its seed first, and its clean points."""
-        _, inside = tree.query(tree.data[rng.integers(tree.n)], k=PATCH_SIZE)
-        return tree.data[inside], self.clouds[which][inside]

@@ -68,7 +68,6 @@ def train(
     distance: Path | None = None,
     settled: bool = False,
     euler_steps: int = 1,
-    carried: Path | None = None,
     on_step: Callable[[TrainStep], None] | None = None,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
@@ -78,15 +77,12 @@ def train(
     dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
     up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
     another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each batch, one thread
-    each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on (`coupled_loss`). carried:
-    clouds after a pass, which `carry` wrote: stage cvm is trained on those as well, on a CPU.
+    each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on (`coupled_loss`).
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
     and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
-    if carried is not None and (stage != "cvm" or device != "cpu"):
-        raise InvalidOptions("carried clouds are for stage cvm on a CPU")
     if threads is not None:
         torch.set_num_threads(threads)
     keep_large_buffers()
@@ -105,8 +101,7 @@ def train(
     average = Average(network, _EMA_DECAY)
     start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
-    read = partial(PatchSource.read, data, carried=carried)
-    source = read()
+    source = PatchSource.read(data)
     stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
     if stage == "cvm":
         stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
@@ -114,7 +109,7 @@ def train(
     share = batch_size // processes
     team = None
     if processes > 1:
-        team = Team(processes - 1, network, trained, stage_loss, read, share, (seed, start))
+        team = Team(processes - 1, network, trained, stage_loss, data, share, (seed, start))
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"

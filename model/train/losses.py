@@ -8,6 +8,7 @@ inverse of the target's covariance given the clean points around (`precision`).
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import torch
 
@@ -23,8 +24,6 @@ _TRAJECTORIES = 0.25  # the share of a batch that L_C moves
 _UNIT = 3 * NOISE_STD**2  # the mean of |y - x_0|^2
 # Spread of the target, in units of the noise at time t, at which an error counts by half.
 _KNOWABLE = 1.0
-_KNOWABLE_CARRIED = 0.1  # of carried patches
-_NEAREST = 0.05  # d of a carried patch is taken as no less: its velocity is what is left, divided by d
 _LATEST = 0.9  # the noise at time t is taken as no less than at this one: float32 covariances bear no less
 
 
@@ -44,16 +43,13 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
     ends farther from the surface than two copies of a single module do (docs/training.md).
     """
     evaluations = [velocity for _ in range(euler_steps) for velocity in network.velocity_modules]
-    positions = turns(len(evaluations)).to(batch.noisy.device)
-    carried = batch.time.isnan()
-    batch = _timed(network, batch)
+    positions = _turns(len(evaluations), batch.noisy.device)
     target = batch.clean - batch.noisy
-    weight = precision(batch, target.shape[1], carried)
-    share = torch.where(carried, 1 - batch.time, 1.0)[:, :, :, None]  # far in time, their velocities err more
+    weight = precision(batch, target.shape[1])
     x = batch.at(batch.time)
     step = (1 - batch.time) / len(evaluations)
     loss = x.new_zeros(())
-    beyond = x[:, rows:0]
+    beyond = torch.zeros_like(x[:, rows:])
     for k, (velocity, turn) in enumerate(zip(evaluations, positions, strict=True), start=1):
         v = velocity(x @ turn, rows if k > 1 else None) @ turn.mT
         some = slice(v.shape[1])
@@ -61,32 +57,28 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
         if k == 1:
             beyond = v[:, rows:]
         moved = x[:, some] + step * v
-        loss = loss + _weighted(v - target[:, some], share * weight[:, some])
+        loss = loss + _weighted(v - target[:, some], weight[:, some])
         loss = loss + LAMBDA_1 * _weighted(moved - there, weight[:, some])
         x = moved if k == 1 else torch.cat([moved, x[:, rows:] + step * beyond], dim=1)
     return loss / euler_steps
 
 
 @torch.no_grad()
-def precision(batch: Batch, rows: int, carried: torch.Tensor | None = None) -> torch.Tensor:
+def precision(batch: Batch, rows: int) -> torch.Tensor:
     """Weigh the errors of the first `rows` points of each patch: (B, rows, 3, 3), symmetric, eigenvalues in (0, 1].
 
     s^2 (C + s^2 I)^-1, where C is the covariance of the clean points that x_t may have come from, each as likely as
     the noise at time t makes it, and s is that noise: about 1 across a surface, 1/2 along it, and 1 throughout where
     the noise is smaller than the distance between points. It depends on x_t and the clean points, not on which of
     them is the target: the velocity of least weighted error is still a mean of y - x_0, in which clean clouds that
-    tell more of it count for more. carried: (B, 1, 1), in which patches the noise has been taken across the surface
-    only: along it, it is many times what is left across.
+    tell more of it count for more.
     """
     x = batch.at(batch.time)[:, :rows]
     noise = NOISE_STD * (1 - batch.time).clamp(min=1 - _LATEST)
-    knowable = torch.full_like(noise, _KNOWABLE)
-    if carried is not None:
-        noise, knowable = noise.masked_fill(carried, NOISE_STD), knowable.masked_fill(carried, _KNOWABLE_CARRIED)
-    parts = [(x, batch.clean, noise, knowable)]
+    parts = [(x, batch.clean, noise)]
     if x.device.type == "cpu":  # one patch's tensors fit the cache, a batch's do not
-        parts = list(zip(*(t.chunk(len(x)) for t in parts[0]), strict=True))
-    spread = torch.cat([_covariance(*part[:3]) / (part[3] * part[2]).square() for part in parts])
+        parts = list(zip(*(t.chunk(len(x)) for t in (x, batch.clean, noise)), strict=True))
+    spread = torch.cat([_covariance(*part) / (_KNOWABLE * part[2]).square() for part in parts])
     return _inverse_of_one_plus(spread)
 
 
@@ -108,15 +100,9 @@ def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor
     return torch.add(loss, LAMBDA_2 * (x - clean[:, : x.shape[1]]).square().sum(dim=2).mean())
 
 
-@torch.no_grad()
-def _timed(network: StraightPCF, batch: Batch) -> Batch:
-    """Give carried patches the time that the DistanceModule reads off them, and the x_0 that is on their way then."""
-    carried = batch.time.isnan()
-    if not carried.any():
-        return batch
-    distance = network.distance_module(batch.noisy)[:, :, None].clamp(min=_NEAREST)
-    noisy = torch.where(carried, batch.clean + (batch.noisy - batch.clean) / distance, batch.noisy)
-    return Batch(noisy, batch.clean, torch.where(carried, 1 - distance, batch.time))
+@cache
+def _turns(count: int, device: torch.device) -> torch.Tensor:
+    return turns(count).to(device)  # once: a CUDA graph holds no copy from the host
 
 
 def _covariance(x: torch.Tensor, clean: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ class Team:
         network: StraightPCF,
         trained: torch.nn.Module,
         loss: NetworkLoss,
-        source: Callable[[], PatchSource],
+        data: Path,
         batch_size: int,
         seed: tuple[int, ...],
     ) -> None:
@@ -42,7 +43,7 @@ class Team:
             ours, theirs = context.Pipe()
             gradient = torch.zeros(sum(p.numel() for p in self._parameters))
             gradient.share_memory_()  # type: ignore[no-untyped-call]
-            arguments = (theirs, network, trained, loss, gradient, source, batch_size, (*seed, number))
+            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number))
             context.Process(target=_work, args=arguments, daemon=True).start()
             theirs.close()
             self._members.append((ours, gradient))
@@ -84,7 +85,7 @@ def _work(
     trained: torch.nn.Module,
     loss_of: NetworkLoss,
     gradient: torch.Tensor,
-    read: Callable[[], PatchSource],
+    data: Path,
     batch_size: int,
     seed: tuple[int, ...],
 ) -> None:
@@ -92,7 +93,7 @@ def _work(
     keep_large_buffers()
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**62)))  # dropout
-    source = read()
+    source = PatchSource.read(data)
     try:
         while True:
             trained.train(pipe.recv())

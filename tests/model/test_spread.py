@@ -43,7 +43,7 @@ def test_the_border_of_a_sheet_stays() -> None:
     assert not moved[:, 2].any()
     border = (np.abs(grid[:, :2]) == 1).any(axis=1)
     outward = (moved * grid)[border].sum(axis=1)
-    assert outward.max() < 0.2 * 0.05  # of the grid's spacing
+    assert outward.max() < 0.25 * 0.05  # of the grid's spacing
     assert abs(outward.mean()) < 0.03 * 0.05
 
 

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import Stage, train
-from straightpcf.model.train.carry import carry
-from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource, held_out_shapes
+from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, precision, velocity_loss
 from straightpcf.model.train.soap import SOAP
@@ -244,7 +242,7 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
     network = StraightPCF(couplings=1).eval()
     trained = network.velocity_modules
     loss_of = partial(velocity_loss, rows=64)
-    team = Team(1, network, trained, loss_of, partial(PatchSource.read, data), 2, (7,))
+    team = Team(1, network, trained, loss_of, data, 2, (7,))
     source = PatchSource.read(data)
     ours = source.draw(np.random.default_rng(8), 2)
 
@@ -285,49 +283,6 @@ def test_the_coupled_loss_takes_the_pass_that_the_filter_takes(data: Path, euler
     assert len(trained) == len(seen) == count
     for ours, theirs in zip(trained, seen, strict=True):
         torch.testing.assert_close(ours, theirs)
-
-
-@pytest.fixture(scope="module")
-def carried(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("carried") / "carried.npz"
-    network = StraightPCF()
-    for module in network.velocity_modules:
-        module.start_slow()
-    assert carry(Filter(network, threads=1), data, path, noise_stds=[0.01, 0.02], points=[2000]) == 20
-    return path
-
-
-def test_carried_clouds_are_those_of_training_after_a_pass(data: Path, carried: Path) -> None:
-    with np.load(data) as clean, np.load(carried) as after:
-        for name in after.files:
-            cloud, number = name.rsplit("/", 1)
-            assert cloud.split("/")[0] not in held_out_shapes(clean.files)
-            assert after[name].dtype == np.float32
-            left = np.linalg.norm(after[name] - clean[cloud], axis=1)
-            assert 0.5 < left.mean() / (0.016 * (1 + int(number))) < 3  # an untrained network moves little
-
-
-def test_a_coupled_stack_trains_on_carried_clouds(
-    data: Path, carried: Path, tmp_path: Path, velocity_run: Path
-) -> None:
-    source = PatchSource.read(data, carried=carried)
-    batch = source.draw(np.random.default_rng(0), 16)
-    after = batch.time.isnan().flatten()
-    assert 4 <= after.sum() <= 12
-    assert (batch.noisy[after].norm(dim=2).amin(dim=1) < 1e-5).all()
-    torch.manual_seed(0)
-    network = StraightPCF(couplings=2).eval()
-    starts: list[torch.Tensor] = []
-    network.velocity_modules[0].register_forward_pre_hook(lambda _, inputs: starts.append(inputs[0]))
-    with torch.no_grad():
-        assert torch.isfinite(coupled_loss(network, batch, 64))
-    torch.testing.assert_close(starts[0][after], batch.noisy[after] @ turns(2)[0], rtol=1e-4, atol=1e-5)
-    path = train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=4, threads=1, processes=2,
-                 init=velocity_run, carried=carried)  # fmt: skip
-    assert read_network(path)[1]["iteration"] == 1
-    with pytest.raises(InvalidOptions, match="carried"):
-        train("vm", data=data, run_dir=tmp_path / "vm", iterations=1, carried=carried)
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
