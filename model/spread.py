@@ -61,7 +61,8 @@ def _chunks(count: int) -> Iterator[slice]:
 
 def _length(vectors: Floats) -> Floats:
     """Return the lengths of (..., 3) vectors, (..., 1)."""
-    return np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    squared: Floats = (vectors * vectors).sum(axis=-1, keepdims=True)
+    return np.sqrt(squared)
 
 
 def _normals(around: Floats) -> Floats:

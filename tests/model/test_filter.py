@@ -40,6 +40,13 @@ def test_noise_shrinks_on_a_torus(shipped: Filter) -> None:
     assert result.noise_after < result.noise_before
 
 
+def test_what_is_curved_is_not_shrunk(shipped: Filter) -> None:
+    cloud = noisy(torus(5000), 0.02)
+    xyz = shipped.denoise(cloud, DenoiseOptions(iterations=3)).xyz
+    tube = np.hypot(np.hypot(xyz[:, 0], xyz[:, 1]) - 0.7, xyz[:, 2])
+    assert abs(tube.mean() - 0.3) < 0.0007  # the clean points around a noisy one lie H s^2 = 0.0008 beneath its foot
+
+
 def test_a_clean_sphere_hardly_moves(shipped: Filter) -> None:
     cloud = sphere(4000)
     moved = np.linalg.norm(shipped.denoise(cloud).xyz - cloud, axis=1)
