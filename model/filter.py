@@ -279,7 +279,7 @@ class Run:
     def _evened(self, here: npt.NDArray[np.float64], planned: int | None) -> npt.NDArray[np.float64] | float:
         """Return how points go along the surface before the pass that comes, (N, 3); not before the first.
 
-        Nor in a scene: scan lines are no clumps.
+        Nor in a scene: scan lines are no clumps. d is read of the points so spread, also where no pass comes after.
         """
         if not self.filter.even or self.iterations in (0, planned) or self.scene:
             return 0.0

@@ -28,7 +28,8 @@ def spread(xyz: Floats, limit: float, *, workers: int = 1) -> Floats:
     Noise moves points along a surface as far as across it, and leaves them in clumps and gaps that no clean cloud has;
     where each came from cannot be known, but that they were apart can. A weighted repulsion in the tangent plane, as in
     LOP (Lipman et al. 2007, "Parameterization-free projection for geometry reconstruction"). limit: the farthest that
-    any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay.
+    any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay. Takes the whole cloud
+    at once, on the host, whatever tiles and device the filter has.
     """
     tree = cKDTree(xyz)
     pushing = np.empty((len(xyz), min(_PUSHING, len(xyz) - 1)), dtype=np.int32)
@@ -68,7 +69,8 @@ def _length(vectors: Floats) -> Floats:
 def _normals(around: Floats) -> Floats:
     """Return (n, 3) directions in which (n, k, 3) points spread least; of length 0 where they are in a line.
 
-    The inverse of their covariance, taken as its adjugate to the fourth power, is that direction times itself.
+    The inverse of their covariance, taken as its adjugate to the fourth power, is that direction times itself. An
+    approximation, unsigned, where `recompute_normals` is exact: eigenvectors took most of a spread's time.
     """
     x, y, z = np.moveaxis(around - around.mean(axis=1, keepdims=True), 2, 0)
     xx, yy, zz, xy, xz, yz = ((a * b).sum(axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))

@@ -56,9 +56,11 @@ class DevicePatchSource:
         turn = torch.empty(batch_size, PATCH_SIZE, device=device).exponential_()
         turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
         inside = inside.gather(1, turn.argsort(dim=1))
-        here, clean = here.gather(1, _rows(inside)), clean.gather(1, _rows(inside))
-        clean = torch.where(time < TOUCH_UNTIL, self.touching(which, here, clean), clean)
-        noisy = torch.lerp(clean, here, 1 / (1 - time))
+        noisy, here, clean = (part.gather(1, _rows(inside)) for part in (noisy, here, clean))
+        early = time < TOUCH_UNTIL
+        clean = torch.where(early, self.touching(which, here, clean), clean)
+        # Late in time x_0 stays as drawn: float32 cannot find it again from x_t.
+        noisy = torch.where(early, torch.lerp(clean, here, 1 / (1 - time)), noisy)
         scale = torch.empty(batch_size, 1, 1, device=device).uniform_(*SCALES)
         transform = random_rotations(batch_size, device) * scale
         return Batch((noisy - origin) @ transform, (clean - origin) @ transform, time)
