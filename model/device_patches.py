@@ -54,11 +54,12 @@ def _farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
         return torch.arange(len(points), device=points.device)
     seeds = torch.empty(wanted, dtype=torch.int64, device=points.device)
     nearest = torch.full((len(points),), torch.inf, device=points.device)
-    last = torch.tensor(first, device=points.device)
+    last = torch.tensor([first], device=points.device)
     for n in range(wanted):
-        seeds[n] = last
-        torch.minimum(nearest, (points - points[last]).square().sum(dim=1), out=nearest)
-        last = nearest.argmax()
+        seeds[n : n + 1] = last
+        # Not points[last] with a scalar: torch would fetch that from the device.
+        torch.minimum(nearest, (points - points.index_select(0, last)).square().sum(dim=1), out=nearest)
+        last = nearest.argmax(keepdim=True)
     return seeds
 
 

@@ -21,11 +21,12 @@ from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
+from straightpcf.model.on_device import OnDevice
 from straightpcf.model.patches import Patches
 from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.turns import turns
-from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints, TooLarge
+from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
 __all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
@@ -39,7 +40,6 @@ TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 _PROBES = 48  # patches on which "auto" reads the noise
-_CUDA_BATCH = 32
 
 _T = TypeVar("_T")
 
@@ -128,7 +128,6 @@ class Filter:
         euler_steps: int = EULER_STEPS,
         full_evaluations: int = FULL_EVALUATIONS,
         even: bool = True,
-        batch: int | None = None,
         tile_points: int | None = None,
     ) -> None:
         """Put a network between the stages.
@@ -149,42 +148,24 @@ class Filter:
         self.full_evaluations = full_evaluations
         self.even = even
         self.turns = turns(_TURNS).to(device)
-        self.batch = batch or (1 if device == "cpu" else _CUDA_BATCH)  # patches at once; halved when memory runs out
+        self.on_device = None if device == "cpu" else OnDevice(self.forward, self.network.distance_module, device)
         keep_large_buffers()
 
-    def move(
-        self, x: torch.Tensor, owned: npt.NDArray[np.int64], distance: torch.Tensor | None = None
-    ) -> list[npt.NDArray[np.float64]]:
-        """Return how far the first owned[i] points of each patch move: (B, P, 3) float32 -> B x (owned[i], 3).
+    def forward(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        """Return how far the first `rows` points of patches (B, P, 3) float32 move in a pass, (B, rows, 3).
 
-        distance: (B, 1), where the DistanceModule has been asked before.
-
-        A device that runs out of memory gets half as many patches at once from then on; raises TooLarge if one alone
-        is too many.
+        owned: (B,), of how many only that is asked; distance: (B, 1), where the DistanceModule has been asked before.
         """
-        moves: list[npt.NDArray[np.float64]] = []
-        while len(moves) < len(x):
-            some, batch = slice(len(moves), len(moves) + self.batch), self.batch
-            rows = max(1, int(owned[some].max()))
-            try:
-                moved, _ = self.network(
-                    x[some],
-                    euler_steps=self.euler_steps,
-                    rows=rows,
-                    owned=torch.from_numpy(owned[some]).to(x.device),
-                    full_evaluations=self.full_evaluations,
-                    distance=None if distance is None else distance[some],
-                    turns=self.turns,
-                )
-                displacements = (moved - x[some, :rows]).double().cpu().numpy()
-            except torch.OutOfMemoryError as exc:
-                if batch == 1:
-                    raise TooLarge(f"{self.device} has no memory for a patch of {x.shape[1]} points") from exc
-                self.batch = batch // 2
-                torch.cuda.empty_cache()
-            else:
-                moves += [move[:count] for move, count in zip(displacements, owned[some], strict=True)]
-        return moves
+        moved: torch.Tensor = self.network(
+            x,
+            euler_steps=self.euler_steps,
+            rows=rows,
+            owned=owned,
+            full_evaluations=self.full_evaluations,
+            distance=distance,
+            turns=self.turns,
+        )[0]
+        return moved - x[:, :rows]
 
     def denoise(
         self,
@@ -231,6 +212,7 @@ class Run:
         self.noise = [0.0, 0.0]
         self.distances: list[float] = []
         self.scene = False
+        self.cuts: list[Patches] = []  # of the last pass, where the filter has a device
         self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
 
     def patches(self) -> Iterator[FinishedPatch]:
@@ -239,11 +221,12 @@ class Run:
             return
         planned = None if self.options.iterations == "auto" else self.options.iterations
         tiles = split(self.points.xyz, self.filter.tile_points)
+        tiling: Tiling | None = None
         with ThreadPoolExecutor(self.filter.threads, initializer=_one_thread) as pool:
             while True:
                 here = self.frame.enter(self.points.xyz)
                 here += self.moved
-                evened = self._evened(here, planned)
+                evened = self._evened(here, tiling, planned)
                 here += evened
                 tiling = Tiling(
                     here, tiles, coverage=self.filter.coverage, seed=self.options.seed, device=self.filter.device
@@ -276,14 +259,23 @@ class Run:
             return planned - self.iterations
         return self.filter.calibration.passes_left(self.distances)
 
-    def _evened(self, here: npt.NDArray[np.float64], planned: int | None) -> npt.NDArray[np.float64] | float:
-        """Return how points go along the surface before the pass that comes, (N, 3); not before the first.
+    def _evened(
+        self, here: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
+    ) -> npt.NDArray[np.float64] | float:
+        """Return how points go along the surface before the pass that comes, (N, 3); tiling: the last pass's.
 
-        Nor in a scene: scan lines are no clumps. d is read of the points so spread, also where no pass comes after.
+        Not before the first, nor in a scene: scan lines are no clumps. d is read of the points so spread, also where
+        no pass comes after.
         """
-        if not self.filter.even or self.iterations in (0, planned) or self.scene:
+        if tiling is None or not self.filter.even or self.iterations == planned or self.scene:
             return 0.0
-        return spread(here, _EVENED * self.noise[0], workers=self.filter.threads)
+        limit = _EVENED * self.noise[0]
+        if self.filter.on_device is not None:
+            return self.filter.on_device.spread(here, self.cuts, limit)
+        evened = np.empty_like(here)
+        for rows, own in tiling.surroundings():
+            evened[rows[:own]] = spread(here[rows], limit, workers=self.filter.threads)[:own]
+        return evened
 
     def _pass(
         self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor, left: int
@@ -291,7 +283,10 @@ class Run:
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
         settled = 0
         # The patches are cut from `here`, so results may be written into self.moved as they come.
+        self.cuts.clear()
         for cut in tiling.cuts():
+            if self.filter.on_device is not None:
+                self.cuts.append(cut)
             scales = patch_scales(cut.radii, scene=self.scene)
             for patch, displacement in self._displacements(here, cut, scales, pool):
                 owned = cut.owned_points(patch)
@@ -308,24 +303,19 @@ class Run:
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
     ) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
         """Run the network over all patches; yield each one's displacements of the points it owns, in its own scale."""
-        step = self.filter.batch
+        if self.filter.on_device is not None:
+            yield from self.filter.on_device.displacements(here, cut, scales, self.probed)
+            return
 
-        def move(first: int) -> list[npt.NDArray[np.float64]]:
-            chosen = range(first, min(first + step, len(cut.seeds)))
-            known = [self.probed[i] for i in chosen if i in self.probed]
-            distance = torch.tensor(known, device=self.filter.device)[:, None] if len(known) == len(chosen) else None
-            return self.filter.move(self._tensor(here, cut, scales, chosen), cut.owned[first : chosen.stop], distance)
+        def move(patch: int) -> npt.NDArray[np.float64]:
+            known = self.probed.get(patch)
+            distance = None if known is None else torch.tensor([[known]])
+            owned = int(cut.owned[patch])
+            x = _tensor(here, cut, scales, patch)
+            return self.filter.forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned].double().numpy()
 
-        starts = range(0, len(cut.seeds), step)
-        results = _bounded_map(pool, move, starts, ahead=2 * self.filter.threads)
-        for first, displacements in zip(starts, results, strict=True):
-            yield from enumerate(displacements, start=first)
-
-    def _tensor(
-        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], chosen: range | list[int]
-    ) -> torch.Tensor:
-        local = [(here[cut.index[i]] - here[cut.seeds[i]]) * scales[i] for i in chosen]
-        return torch.from_numpy(np.stack(local).astype(np.float32)).to(self.filter.device)  # (B, P, 3)
+        results = _bounded_map(pool, move, range(len(cut.seeds)), ahead=2 * self.filter.threads)
+        yield from enumerate(results)
 
     def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor) -> float:
         """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame."""
@@ -333,11 +323,15 @@ class Run:
         self.scene = is_scene(probes.radii)
         scales = patch_scales(probes.radii, scene=self.scene)
 
-        def read(patch: int) -> float:
-            with torch.inference_mode():
-                return float(self.filter.network.distance_module(self._tensor(here, probes, scales, [patch])))
+        if self.filter.on_device is not None:
+            distances = self.filter.on_device.distances(here, probes, scales)
+        else:
 
-        distances = np.array(list(pool.map(read, range(len(probes.seeds)))))
+            def read(patch: int) -> float:
+                with torch.inference_mode():
+                    return float(self.filter.network.distance_module(_tensor(here, probes, scales, patch)))
+
+            distances = np.array(list(pool.map(read, range(len(probes.seeds)))))
         self.probed = dict(zip(numbers, distances.tolist(), strict=False))
         self.distances.append(float(np.median(distances)))
         return float(np.median(self.filter.calibration.noise_std(distances) / scales))
@@ -376,6 +370,12 @@ def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
         hashed ^= (xyz[:, axis] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
     hashed.sort()
     return bool((hashed[1:] == hashed[:-1]).any())
+
+
+def _tensor(here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], patch: int) -> torch.Tensor:
+    """Cut one patch out of the points, centred on its seed: (1, P, 3) float32."""
+    local = (here[cut.index[patch]] - here[cut.seeds[patch]]) * scales[patch]
+    return torch.from_numpy(local[None].astype(np.float32))
 
 
 def _one_thread() -> None:

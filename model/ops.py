@@ -13,7 +13,8 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
     """Find each point's k nearest others inside its patch.
 
     x: (B, P, C) float32, P > 1; rows: only for the first `rows` points, all if None.
-    Returns (B, rows, k) indices into P, int32 from the kernels and int64 from torch. k > P - 1 repeats the farthest.
+    Returns (B, rows, k) indices into P in any order, int32 from the kernels and int64 from torch. k > P - 1 repeats
+    the farthest.
     """
     rows = x.shape[1] if rows is None else rows
     if x.is_cuda and cuda.load():

@@ -86,10 +86,17 @@ class Tiling:
         if self.whole is not None:
             yield self.whole
             return
-        for core, margin in zip(self._tiles, self._margins, strict=True):
-            rows = np.concatenate([core, _halo(self._xyz, core, margin)])
+        for rows, own in self.surroundings():
             cut = self._cut(self._xyz[rows])
-            yield cut.owning_below(len(core)).of_rows(rows)
+            yield cut.owning_below(own).of_rows(rows)
+
+    def surroundings(self) -> Iterator[tuple[npt.NDArray[np.int64], int]]:
+        """Yield each tile's rows, those of its halo behind, and how many are its own. Call `probes` before."""
+        if len(self._tiles) == 1:
+            yield self._tiles[0], len(self._tiles[0])
+            return
+        for core, margin in zip(self._tiles, self._margins, strict=True):
+            yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
 
 
 def _halo(xyz: npt.NDArray[np.float64], core: npt.NDArray[np.int64], margin: float) -> npt.NDArray[np.int64]:

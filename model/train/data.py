@@ -19,6 +19,7 @@ from straightpcf.points.errors import InvalidOptions
 
 __all__ = [
     "CANDIDATES",
+    "EARLIEST",
     "NEAR_SHARE",
     "NEAR_WEIGHT",
     "NOISE_STD",
@@ -34,12 +35,13 @@ __all__ = [
 
 PATCH_SIZE = 1000
 NOISE_STD = 0.02  # of x_0, in radii of the cloud's bounding sphere
+EARLIEST = -0.5  # paths are taken up at times from here to 1: x_t has noise from 3 % down
 SCALES = (0.8, 1.2)  # augmentation
 # Every tenth shape by name stays out of training, so that there is something honest to choose by.
 VALIDATION_EVERY = 10
 # Noise moves points in and out of a patch: the noisy patch is chosen among this many clean neighbours. Of a patch of
-# the filter at 50K points and 2 %, 1300 lack 4 % (at most 18 %), 2600 lack 0.04 % (2 %).
-CANDIDATES = 2600
+# the filter at 50K points and 3 %, 2600 lack 1.2 % (at most 12 %), 4000 lack 0.2 % (2 %).
+CANDIDATES = 4000
 # The filter keeps of a patch what lies near its seed (a third, at 3-fold coverage): of the points that come first in a
 # batch, and so into the loss, nine of ten are of the nearer half.
 NEAR_SHARE, NEAR_WEIGHT = 0.5, 9.0
@@ -51,9 +53,9 @@ TOUCH_UNTIL = 0.98
 class Batch:
     """B patches, in the frame of the seed's noisy position at time t, points near the seed likely to come first.
 
-    noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [0, 1). Across the surface y is
-    on the plane that touches it where x_t is nearest (`Surface.touching`), and x_0 on the line
-    from there through x_t.
+    noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [EARLIEST, 1). Across the
+    surface y is on the plane that touches it where x_t is nearest (`Surface.touching`), and x_0 on the line from there
+    through x_t.
     """
 
     noisy: torch.Tensor
@@ -143,7 +145,7 @@ class PatchSource:
         seed = cloud[rng.integers(len(cloud))]
         _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
         clean = cloud[near]  # row 0 is the seed
-        time = rng.random()
+        time = rng.uniform(EARLIEST, 1)
         here = clean + (1 - time) * NOISE_STD * rng.standard_normal(clean.shape)
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.

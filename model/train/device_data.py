@@ -8,6 +8,7 @@ import torch
 
 from straightpcf.model.train.data import (
     CANDIDATES,
+    EARLIEST,
     NEAR_SHARE,
     NEAR_WEIGHT,
     NOISE_STD,
@@ -48,7 +49,7 @@ class DevicePatchSource:
         near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
         clean = clouds.gather(1, _rows(near))
         noisy = clean + NOISE_STD * torch.randn_like(clean)
-        time = torch.rand(batch_size, 1, 1, device=device)
+        time = torch.empty(batch_size, 1, 1, device=device).uniform_(EARLIEST, 1)
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
         squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does

@@ -37,17 +37,18 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
     """L_B: every evaluation's velocity, plus lambda_1 times where it leaves the points (stage 2).
 
     The K modules take N = euler_steps rounds of shorter and shorter ways along their own path, as the filter runs
-    them: evaluation k of N K starts where k - 1 left the points, at time t + (k - 1) (1 - t) / (N K), in a position of
-    its own, and all but the first move the first `rows` points only. The paper has N = 1 and leaves out where the last
-    module leaves the points: then it learns to go on straight, also from where the first has gone wrong, and the stack
-    ends farther from the surface than two copies of a single module do (docs/training.md).
+    them: evaluation k of N K starts where k - 1 left the points, at time t + (k - 1) s / (N K) for a pass of length
+    s = 1 - t, 1 at most, in a position of its own, and all but the first move the first `rows` points only. The paper
+    has N = 1 and leaves out where the last module leaves the points: then it learns to go on straight, also from where
+    the first has gone wrong, and the stack ends farther from the surface than two copies of a single module do
+    (docs/training.md).
     """
     evaluations = [velocity for _ in range(euler_steps) for velocity in network.velocity_modules]
     positions = _turns(len(evaluations), batch.noisy.device)
     target = batch.clean - batch.noisy
     weight = precision(batch, target.shape[1])
     x = batch.at(batch.time)
-    step = (1 - batch.time) / len(evaluations)
+    step = _to_go(batch) / len(evaluations)
     loss = x.new_zeros(())
     beyond = torch.zeros_like(x[:, rows:])
     for k, (velocity, turn) in enumerate(zip(evaluations, positions, strict=True), start=1):
@@ -85,19 +86,25 @@ def precision(batch: Batch, rows: int) -> torch.Tensor:
 def distance_loss(network: StraightPCF, batch: Batch, rows: int) -> torch.Tensor:
     """L_C: (d - (1 - t))^2 plus lambda_2 |y - X|^2 where d scales the frozen trajectory to X (stage 3).
 
-    The second term is the mean over the first quarter of the batch: of the same expectation, and the trajectory costs
-    three times what the DistanceModule does.
+    d is 1 at most: where t < 0, so is its target, and y gives way to x_t+1, as far as that leads. The second term is
+    the mean over the first quarter of the batch: of the same expectation, and the trajectory costs three times what
+    the DistanceModule does.
     """
     x = batch.at(batch.time)
     distance = network.distance_module(x)[:, :, None]
-    loss = (distance - (1 - batch.time)).square().mean()
+    to_go = _to_go(batch)
+    loss = (distance - to_go).square().mean()
     some = math.ceil(len(x) * _TRAJECTORIES)
-    x, distance, clean = x[:some], distance[:some], batch.clean[:some]
+    x, distance, there = x[:some], distance[:some], batch.at(batch.time + to_go)[:some]
     couplings = len(network.velocity_modules)
     for k, velocity in enumerate(network.velocity_modules, start=1):
         v = velocity(x, rows if k == couplings else None)
         x = x[:, : v.shape[1]] + distance / couplings * v
-    return torch.add(loss, LAMBDA_2 * (x - clean[:, : x.shape[1]]).square().sum(dim=2).mean())
+    return torch.add(loss, LAMBDA_2 * (x - there[:, : x.shape[1]]).square().sum(dim=2).mean())
+
+
+def _to_go(batch: Batch) -> torch.Tensor:
+    return (1 - batch.time).clamp(max=1)  # of the way from x_0 to y, as far as one pass goes: (B, 1, 1)
 
 
 @cache

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints, TooLarge
+from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, sphere, torus
 
@@ -160,31 +158,6 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
 def test_a_device_that_is_not_here_is_named() -> None:
     with pytest.raises(DeviceUnavailable, match="cuda"):
         load_filter(device="cuda")
-
-
-class _SmallMemory(torch.nn.Module):
-    """A network that runs out of memory above so many patches."""
-
-    def __init__(self, network: StraightPCF, most: int) -> None:
-        super().__init__()
-        self.network, self.most = network, most
-        self.distance_module = network.distance_module
-
-    def forward(self, x: torch.Tensor, **how: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        if len(x) > self.most:
-            raise torch.OutOfMemoryError(f"{len(x)} patches")
-        moved, distance = self.network(x, **how)
-        return moved, distance
-
-
-def test_out_of_memory_halves_the_batch_and_goes_on(tiny: Filter) -> None:
-    cloud = noisy(torus(4000), 0.01)
-    small = Filter(_SmallMemory(tiny.network, 3), threads=1, coverage=2, batch=8)  # type: ignore[arg-type]
-    np.testing.assert_allclose(small.denoise(cloud, ONE_PASS).xyz, tiny.denoise(cloud, ONE_PASS).xyz, atol=1e-6)
-    assert small.batch == 2
-    none = Filter(_SmallMemory(tiny.network, 0), threads=1, coverage=2, batch=8)  # type: ignore[arg-type]
-    with pytest.raises(TooLarge, match="patch of 1000"):
-        none.denoise(cloud, ONE_PASS)
 
 
 @pytest.mark.parametrize("name", ["tpu", "cuda:", "cuda:x", "auto:1", ""])

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
@@ -59,6 +60,18 @@ def test_no_seam_is_to_be_seen() -> None:
     off = [np.square(distance_to_torus(cloud[at_a_seam])).mean() for cloud in (in_tiles, at_once)]
     assert off[0] < 1.05 * off[1]
     assert np.linalg.norm(in_tiles - at_once, axis=1)[at_a_seam].mean() < 0.2 * np.abs(xyz - clean).mean()
+
+
+def test_a_tile_and_its_halo_are_spread_as_the_whole_cloud_is() -> None:
+    xyz = noisy(torus(20_000), 0.005)
+    tiling = Tiling(xyz, split(xyz, 6000), coverage=3, seed=0)
+    tiling.probes(48)
+    expected = spread(xyz, 0.01)
+    seen = 0
+    for rows, own in tiling.surroundings():
+        np.testing.assert_allclose(spread(xyz[rows], 0.01)[:own], expected[rows[:own]], atol=1e-12)
+        seen += own
+    assert seen == len(xyz)
 
 
 def test_tiles_smaller_than_a_few_patches_are_refused() -> None:

@@ -11,9 +11,9 @@ import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import Stage, train
-from straightpcf.model.train.data import NOISE_STD, PATCH_SIZE, Batch, PatchSource
+from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
-from straightpcf.model.train.losses import coupled_loss, precision, velocity_loss
+from straightpcf.model.train.losses import coupled_loss, distance_loss, precision, velocity_loss
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import read_network
 from straightpcf.model.train.team import Team
@@ -84,6 +84,36 @@ def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
     within = (reach < 0.9 * reach.amax(dim=1, keepdim=True)).float().mean(dim=1)
     late = batch.time.flatten() > 0.7
     assert within[late].mean() == pytest.approx(0.81, abs=0.02)
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_paths_are_taken_up_before_their_start_too(data: Path, *, on_device: bool) -> None:
+    source = PatchSource.read(data)
+    torch.manual_seed(0)
+    device = torch.device("cpu")
+    batch = DevicePatchSource(source, device).draw(64) if on_device else source.draw(np.random.default_rng(0), 64)
+    assert EARLIEST <= batch.time.min() < 0.7 * EARLIEST
+    assert 0.9 < batch.time.max() < 1
+    noise = (batch.at(batch.time) - batch.clean).std(dim=(1, 2)) / (1 - batch.time.flatten())
+    assert ((noise > 0.015) & (noise < 0.025)).all()
+
+
+def test_one_pass_is_asked_to_go_no_farther_than_it_can() -> None:
+    network = StraightPCF(couplings=2).eval()
+    clean = 0.1 * torch.randn(2, 100, 3)
+    batch = Batch(clean + NOISE_STD * torch.randn_like(clean), clean, torch.tensor([-0.5, -0.2]).view(2, 1, 1))
+
+    class Straight(torch.nn.Module):
+        def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
+            return (batch.clean - batch.noisy)[: len(x), :rows]
+
+    class AllTheWay(torch.nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return torch.ones(len(x), 1)
+
+    network.velocity_modules = torch.nn.ModuleList([Straight(), Straight()])
+    network.distance_module = AllTheWay()  # type: ignore[assignment]
+    assert distance_loss(network, batch, 50).item() == pytest.approx(0, abs=1e-6)
 
 
 def test_noisy_points_are_led_to_the_surface_and_not_beneath_it() -> None:
@@ -278,7 +308,7 @@ def test_the_coupled_loss_takes_the_pass_that_the_filter_takes(data: Path, euler
         loss = coupled_loss(network, batch, rows, euler_steps)
         trained, seen[:] = seen[:], []
         network(batch.at(batch.time), euler_steps=euler_steps, rows=rows, owned=torch.tensor([rows, rows]),
-                distance=1 - batch.time[:, :, 0], turns=turns(count))  # fmt: skip
+                distance=(1 - batch.time[:, :, 0]).clamp(max=1), turns=turns(count))  # fmt: skip
     assert torch.isfinite(loss)
     assert len(trained) == len(seen) == count
     for ours, theirs in zip(trained, seen, strict=True):

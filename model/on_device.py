@@ -1,0 +1,208 @@
+"""A pass of the filter on a CUDA device: points go up once, patches are cut out of them there, moves come back.
+
+Written and tested on the CPU, where a captured graph is a function called again; not yet run on a GPU
+(docs/kernels.md).
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from straightpcf.model.ops import knn
+from straightpcf.model.patches import PATCH_SIZE, Patches
+from straightpcf.model.spread import AROUND, spread_among
+from straightpcf.points.errors import TooLarge
+
+__all__ = ["Capture", "Forward", "Graphs", "OnDevice", "capture_cuda_graph"]
+
+Floats = npt.NDArray[np.float64]
+# x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
+Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch.Tensor]
+# A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
+Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
+
+_BATCH = 32
+_ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
+_MOST_GRAPHS = 16
+_IN_FLIGHT = 2  # batches of which the results have not been read
+
+
+def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], object], torch.Tensor]:
+    """Capture one run of a computation, which has run before, as a CUDA graph."""
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        out = run()
+    return graph.replay, out
+
+
+class Graphs:
+    """A Forward replayed as a graph from the third time on that a full patch's shape comes.
+
+    A velocity evaluation is some forty kernels of a few microseconds; launching each takes the host as long. The first
+    call of a shape compiles and sets up what a capture must not; where capturing fails, all goes on without graphs.
+    """
+
+    def __init__(self, forward: Forward, capture: Capture) -> None:
+        self._forward, self._capture = forward, capture
+        self._seen: set[tuple[int, int, bool]] = set()
+        self._graphs: dict[
+            tuple[int, int, bool], tuple[list[torch.Tensor], Callable[[], object], torch.Tensor]
+        ] = {}  # fmt: skip
+        self._broken = False
+
+    def __call__(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        """Do what the Forward does; the next call may overwrite the result, of at least `rows` rows."""
+        rows = min(x.shape[1], _ROWS * math.ceil(rows / _ROWS))
+        key = (len(x), rows, distance is not None)
+        given = [x, owned] if distance is None else [x, owned, distance]
+        if key not in self._graphs:
+            worth = x.shape[1] == PATCH_SIZE and len(self._graphs) < _MOST_GRAPHS and not self._broken
+            if not worth or key not in self._seen:
+                self._seen.add(key)
+                return self._forward(x, owned, distance, rows)
+            inputs = [tensor.clone() for tensor in given]
+            again = partial(self._forward, inputs[0], inputs[1], None if distance is None else inputs[2], rows)
+            try:
+                self._graphs[key] = (inputs, *self._capture(again))
+            except torch.OutOfMemoryError:
+                raise
+            except RuntimeError as exc:
+                warnings.warn(f"the network is not captured as a CUDA graph, it runs without: {exc}", stacklevel=2)
+                self._broken = True
+                return self._forward(x, owned, distance, rows)
+        inputs, replay, out = self._graphs[key]
+        for static, fresh in zip(inputs, given, strict=True):
+            static.copy_(fresh)
+        replay()
+        return out
+
+    def clear(self) -> None:
+        """Give the graphs' memory back."""
+        self._graphs.clear()
+
+
+class OnDevice:
+    """What the filter asks of its device; from one thread at a time."""
+
+    def __init__(
+        self,
+        forward: Forward,
+        distances: Callable[[torch.Tensor], torch.Tensor],
+        device: str,
+        *,
+        batch: int = _BATCH,
+        capture: Capture = capture_cuda_graph,
+    ) -> None:
+        """Take the network's two parts; batch: patches at once, halved when memory runs out."""
+        self.device, self.batch = torch.device(device), batch
+        self._distances, self._graphs = distances, Graphs(forward, capture)
+
+    def displacements(
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
+    ) -> Iterator[tuple[int, Floats]]:
+        """Yield patch after patch, by number, how far the points that it owns move, in its own scale.
+
+        probed: what the DistanceModule said of patches before, by number. While the device computes a batch, the
+        results of the one before come over and are read. Raises TooLarge where it has no memory for one patch.
+        """
+        points = torch.from_numpy(here).to(self.device)
+        waiting: deque[tuple[range, _Result]] = deque()
+        first = 0
+        while first < len(cut.seeds):
+            chosen = range(first, min(first + self.batch, len(cut.seeds)))
+            try:
+                moves = self._launch(points, cut, scales, probed, chosen)
+                waiting.append((chosen, _Result(moves[: len(chosen)])))
+            except torch.OutOfMemoryError as exc:
+                if self.batch == 1:
+                    raise TooLarge(f"{self.device} has no memory for a patch of {cut.index.shape[1]} points") from exc
+                self.batch //= 2
+                self._graphs.clear()
+                torch.cuda.empty_cache()
+                continue
+            first = chosen.stop
+            if len(waiting) == _IN_FLIGHT:
+                yield from _read(*waiting.popleft(), cut)
+        for batch, result in waiting:
+            yield from _read(batch, result, cut)
+
+    @torch.inference_mode()
+    def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
+        """Return what the DistanceModule says of each patch: (M,)."""
+        points = torch.from_numpy(here).to(self.device)
+        batches = (np.arange(len(cut.seeds))[i : i + self.batch] for i in range(0, len(cut.seeds), self.batch))
+        found = [self._distances(_patches(points, cut, scales, batch)) for batch in batches]
+        distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
+        return distances
+
+    @torch.inference_mode()
+    def spread(self, here: Floats, cuts: list[Patches], limit: float) -> Floats:
+        """Do what `model.spread.spread` does, a point's neighbours taken from the patch that owned it."""
+        points = torch.from_numpy(here).to(self.device)
+        nearest = min(AROUND, cuts[0].index.shape[1] - 1)
+        around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
+        for cut in cuts:
+            for first in range(0, len(cut.seeds), self.batch):
+                batch = np.arange(first, min(first + self.batch, len(cut.seeds)))
+                x = _patches(points, cut, np.ones(len(cut.seeds)), batch)
+                index, owned = (torch.from_numpy(part[batch]).to(self.device) for part in (cut.index, cut.owned))
+                rows = max(1, int(cut.owned[batch].max()))
+                patch, row = (torch.arange(rows, device=self.device) < owned[:, None]).nonzero(as_tuple=True)
+                found = knn(x, nearest, rows)[patch, row].long()  # (n, k), in any order
+                far = (x[patch[:, None], found] - x[patch, row][:, None]).square().sum(dim=2)
+                found = found.gather(1, far.argsort(dim=1))
+                around[index[patch, row].long()] = index[patch[:, None], found]
+        moved: Floats = spread_among(points, around, limit).cpu().numpy()
+        return moved
+
+    @torch.inference_mode()
+    def _launch(
+        self, points: torch.Tensor, cut: Patches, scales: Floats, probed: Mapping[int, float], chosen: range
+    ) -> torch.Tensor:
+        # A last batch that is not full is filled up with its last patch: one shape more would be one graph more.
+        full = self.batch if len(cut.seeds) > self.batch else len(chosen)
+        batch = np.minimum(np.arange(chosen.start, chosen.start + full), chosen.stop - 1)
+        known = [probed[i] for i in batch.tolist() if i in probed]
+        distance = torch.tensor(known, device=self.device)[:, None] if len(known) == len(batch) else None
+        owned = torch.from_numpy(cut.owned[batch]).to(self.device)
+        rows = max(1, int(cut.owned[batch].max()))
+        return self._graphs(_patches(points, cut, scales, batch), owned, distance, rows)
+
+
+class _Result:
+    """A batch's moves on their way into page-locked memory."""
+
+    def __init__(self, moves: torch.Tensor) -> None:
+        self._host = torch.empty(moves.shape, dtype=moves.dtype, pin_memory=moves.is_cuda)
+        self._host.copy_(moves, non_blocking=True)
+        self._there = torch.cuda.Event() if moves.is_cuda else None  # type: ignore[no-untyped-call]
+        if self._there is not None:
+            self._there.record()
+
+    def read(self) -> npt.NDArray[np.float32]:
+        if self._there is not None:
+            self._there.synchronize()
+        return self._host.numpy()
+
+
+def _patches(points: torch.Tensor, cut: Patches, scales: Floats, batch: npt.NDArray[np.int64]) -> torch.Tensor:
+    """Cut some patches out of the points, centred on their seeds: (B, P, 3) float32, on the points' device."""
+    index, seeds, scale = (
+        torch.from_numpy(part[batch]).to(points.device) for part in (cut.index, cut.seeds, scales)
+    )  # fmt: skip
+    local = points[index.long()] - points[seeds][:, None]
+    return (local * scale[:, None, None]).float()
+
+
+def _read(batch: range, result: _Result, cut: Patches) -> Iterator[tuple[int, Floats]]:
+    moves = result.read().astype(np.float64)
+    for patch, move in zip(batch, moves, strict=True):
+        yield patch, move[: cut.owned[patch]]

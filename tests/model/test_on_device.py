@@ -1,0 +1,130 @@
+"""The path of a CUDA device, run on the CPU: what it gives is what the host's path gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from straightpcf.model.filter import Filter
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.on_device import Capture, Graphs, OnDevice
+from straightpcf.model.patches import cut_patches
+from straightpcf.model.spread import spread
+from straightpcf.points.errors import TooLarge
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import noisy, sphere, torus
+
+Again = Callable[[], torch.Tensor]
+
+
+def capture_by_calling(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
+    """Stand in for a CUDA graph: replaying runs the computation on what its inputs hold, into the same tensor."""
+    out = run().clone()
+    return lambda: out.copy_(run()), out
+
+
+@pytest.fixture(scope="module")
+def network() -> StraightPCF:
+    torch.manual_seed(0)
+    return StraightPCF(width=64, distance_width=64)
+
+
+def on_device(
+    network: torch.nn.Module, *, batch: int = 4, capture: Capture = capture_by_calling, tile_points: int | None = None
+) -> Filter:
+    model = Filter(network, threads=1, coverage=3, tile_points=tile_points)  # type: ignore[arg-type]
+    distances: Any = network.distance_module
+    model.on_device = OnDevice(model.forward, distances, "cpu", batch=batch, capture=capture)
+    return model
+
+
+@pytest.mark.parametrize("count", [500, 3000, 9000])  # one patch, fewer than a batch, a last batch that is not full
+def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) -> None:
+    cloud = noisy(torus(count), 0.01)
+    options = DenoiseOptions(iterations=3)
+    expected = Filter(network, threads=1, coverage=3).denoise(cloud, options)
+    result = on_device(network).denoise(cloud, options)
+    apart = np.linalg.norm(result.xyz - expected.xyz, axis=1)
+    assert (apart < 1e-4).mean() > 0.98  # spreading: at its rim a patch lacks some of the neighbours
+    assert apart.mean() < 5e-5
+    np.testing.assert_allclose(result.distances, expected.distances, atol=1e-4)
+
+
+def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
+    cloud = noisy(torus(25_000), 0.01)
+    options = DenoiseOptions(iterations=2)
+    expected = Filter(network, threads=1, coverage=3, tile_points=10_000).denoise(cloud, options)
+    result = on_device(network, batch=16, tile_points=10_000).denoise(cloud, options)
+    apart = np.linalg.norm(result.xyz - expected.xyz, axis=1)
+    assert (apart < 1e-4).mean() > 0.98
+
+
+def test_neighbours_of_a_patch_spread_points_as_neighbours_of_the_cloud_do(network: StraightPCF) -> None:
+    ball = sphere(8000, 0)
+    cut = cut_patches(ball, coverage=3, seed=0)
+    moved = on_device(network).on_device.spread(ball, [cut], 1.0)  # type: ignore[union-attr]
+    apart = np.linalg.norm(moved - spread(ball, 1.0), axis=1)
+    assert (apart < 1e-5).mean() > 0.99
+    assert apart.mean() < 0.002 * np.linalg.norm(moved, axis=1).mean()
+
+
+def test_a_shape_is_captured_when_it_comes_again_and_reads_fresh_inputs() -> None:
+    captured = []
+
+    def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        return x[:, :rows] * owned[:, None, None] * (1 if distance is None else distance[:, :, None])
+
+    def capture(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
+        captured.append(run)
+        return capture_by_calling(run)
+
+    graphs = Graphs(forward, capture)
+    for turn in range(4):
+        x, owned = torch.rand(2, 1000, 3), torch.tensor([turn, 1])
+        torch.testing.assert_close(graphs(x, owned, None, 400), x[:, :512] * owned[:, None, None])
+        distance = torch.rand(2, 1)
+        expected = x[:, :1000] * (owned[:, None] * distance)[:, :, None]
+        torch.testing.assert_close(graphs(x, owned, distance, 950), expected)
+        graphs(torch.rand(2, 700, 3), owned, None, 700)  # patches of small clouds have a size each: no graphs for them
+        assert len(captured) == (2 if turn else 0)
+
+
+def test_where_capturing_fails_the_work_goes_on_without_graphs(network: StraightPCF) -> None:
+    def refuse(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    cloud = noisy(torus(12_000), 0.01)
+    with pytest.warns(UserWarning, match="not permitted"):
+        result = on_device(network, capture=refuse).denoise(cloud, DenoiseOptions(iterations=1))
+    expected = Filter(network, threads=1, coverage=3).denoise(cloud, DenoiseOptions(iterations=1))
+    np.testing.assert_allclose(result.xyz, expected.xyz, atol=1e-5)
+
+
+class _SmallMemory(torch.nn.Module):
+    """A network that runs out of memory above so many patches."""
+
+    def __init__(self, network: StraightPCF, most: int) -> None:
+        super().__init__()
+        self.network, self.most = network, most
+        self.distance_module = network.distance_module
+
+    def forward(self, x: torch.Tensor, **how: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        if len(x) > self.most:
+            raise torch.OutOfMemoryError(f"{len(x)} patches")
+        moved, distance = self.network(x, **how)
+        return moved, distance
+
+
+def test_out_of_memory_halves_the_batch_and_goes_on(network: StraightPCF) -> None:
+    cloud, options = noisy(torus(4000), 0.01), DenoiseOptions(iterations=1)
+    small = on_device(_SmallMemory(network, 3), batch=8)
+    expected = Filter(network, threads=1, coverage=3).denoise(cloud, options).xyz
+    np.testing.assert_allclose(small.denoise(cloud, options).xyz, expected, atol=1e-6)
+    assert small.on_device is not None
+    assert small.on_device.batch == 2
+    with pytest.raises(TooLarge, match="patch of 1000"):
+        on_device(_SmallMemory(network, 0), batch=8).denoise(cloud, options)
