@@ -7,6 +7,7 @@ import csv
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -118,7 +119,7 @@ def train(
     fixed = PatchSource.read(data, validation=True).draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
     validation: float | None = None
-    with (run_dir / "log.csv").open("a", newline="") as file:
+    with (run_dir / "log.csv").open("a", newline="") as file, team or nullcontext():
         log = csv.writer(file)
         if start == 0:
             log.writerow(["stage", "iteration", "loss", "validation", "learning_rate", "seconds"])
@@ -153,8 +154,6 @@ def train(
             validation = None
             if last:
                 break
-    if team is not None:
-        team.close()
     return state_path
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ NetworkLoss = Callable[[StraightPCF, Batch], torch.Tensor]
 
 
 class Team:
-    """Processes beside the one that updates the weights, which are moved to shared memory.
+    """Processes beside the one that updates the weights, which are moved to shared memory; for a `with`.
 
     seed: each member draws its own patches from [*seed, its number].
     """
@@ -74,9 +75,15 @@ class Team:
         return loss
 
     def close(self) -> None:
-        """Let the members end."""
+        """Let the members end; leaving a `with` of the team does so too."""
         for pipe, _ in self._members:
             pipe.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
 
 def _work(

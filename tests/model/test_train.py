@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train import Stage, train
+from straightpcf.model.train import Stage, TrainStep, train
 from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision, velocity_loss
@@ -313,6 +314,17 @@ def test_the_coupled_loss_takes_the_pass_that_the_filter_takes(data: Path, euler
     assert len(trained) == len(seen) == count
     for ours, theirs in zip(trained, seen, strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+def test_a_run_that_fails_ends_the_processes_that_share_its_batches(data: Path, tmp_path: Path) -> None:
+    def fail(step: TrainStep) -> None:
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space"):
+        train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1, processes=2, on_step=fail)
+    for process in multiprocessing.active_children():
+        process.join(timeout=30)
+    assert not multiprocessing.active_children()
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
