@@ -20,8 +20,10 @@ from benchmarks.quality import SHARED
 from straightpcf.model.checkpoint import save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, passes, trace
-from straightpcf.model.train.state import read_network, take_distance_module
+from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
+from straightpcf.model.train.state import average_with, read_network, take_distance_module
+
+_TABLE_EVERY = 3  # clouds
 
 
 def main() -> None:
@@ -29,6 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--state", type=Path, required=True, help="the state of a finished stage 3, or 2")
     parser.add_argument("--distance", type=Path, help="a state whose DistanceModule to take instead")
+    parser.add_argument(
+        "--mean", type=Path, help="a state trained on from this one: take the mean of both's velocities"
+    )
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
@@ -42,9 +47,13 @@ def main() -> None:
     network, progress = read_network(arguments.state)
     if arguments.distance is not None:
         take_distance_module(network, arguments.distance)
+    if arguments.mean is not None:
+        average_with(network, arguments.mean)
     clouds = _clouds(arguments.data, arguments.clouds)
-    traces = _traces(Filter(network, threads=arguments.threads), clouds, arguments.noise, arguments.traces)
-    calibration = calibrate(traces)
+    model = Filter(network, threads=arguments.threads)
+    model.calibration = noise_table(model, {name: clouds[name] for name in list(clouds)[::_TABLE_EVERY]})
+    traces = _traces(model, clouds, arguments.noise, arguments.traces)
+    calibration = calibrate(traces, model.calibration)
     columns = f"{'d before each pass':32} {'CD x1e4 after 0, 1, ...':42}"
     print(f"{'cloud':18} {'noise':>7}  {columns} auto best")
     for t in traces:

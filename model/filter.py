@@ -20,7 +20,7 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales
+from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales, zoom_of
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.patches import Patches
 from straightpcf.model.spread import spread
@@ -212,6 +212,7 @@ class Run:
         self.noise = [0.0, 0.0]
         self.distances: list[float] = []
         self.scene = False
+        self.zoom = 1.0  # of the pass that comes
         self.cuts: list[Patches] = []  # of the last pass, where the filter has a device
         self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
 
@@ -287,7 +288,7 @@ class Run:
         for cut in tiling.cuts():
             if self.filter.on_device is not None:
                 self.cuts.append(cut)
-            scales = patch_scales(cut.radii, scene=self.scene)
+            scales = patch_scales(cut.radii, scene=self.scene, zoom=self.zoom)
             for patch, displacement in self._displacements(here, cut, scales, pool):
                 owned = cut.owned_points(patch)
                 self.moved[owned] += displacement / scales[patch]
@@ -318,23 +319,35 @@ class Run:
         yield from enumerate(results)
 
     def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor) -> float:
-        """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame."""
+        """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame.
+
+        Before the first pass over an object it is read a second time, in the size that the first reading asks for.
+        """
         probes, numbers = tiling.probes(_PROBES)
         self.scene = is_scene(probes.radii)
+        self.zoom = 1.0
         scales = patch_scales(probes.radii, scene=self.scene)
-
-        if self.filter.on_device is not None:
-            distances = self.filter.on_device.distances(here, probes, scales)
-        else:
-
-            def read(patch: int) -> float:
-                with torch.inference_mode():
-                    return float(self.filter.network.distance_module(_tensor(here, probes, scales, patch)))
-
-            distances = np.array(list(pool.map(read, range(len(probes.seeds)))))
-        self.probed = dict(zip(numbers, distances.tolist(), strict=False))
+        distances = self._read(here, probes, scales, pool)
         self.distances.append(float(np.median(distances)))
-        return float(np.median(self.filter.calibration.noise_std(distances) / scales))
+        noise = float(np.median(self.filter.calibration.noise_std(distances) / scales))
+        if self.iterations == 0 and not self.scene:
+            self.zoom = zoom_of(noise, probes.radii)
+            distances = self._read(here, probes, patch_scales(probes.radii, scene=False, zoom=self.zoom), pool)
+        self.probed = dict(zip(numbers, distances.tolist(), strict=False))
+        return noise
+
+    def _read(
+        self, here: npt.NDArray[np.float64], probes: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
+    ) -> npt.NDArray[np.float64]:
+        """Return d of each of some patches, (M,)."""
+        if self.filter.on_device is not None:
+            return self.filter.on_device.distances(here, probes, scales)
+
+        def read(patch: int) -> float:
+            with torch.inference_mode():
+                return float(self.filter.network.distance_module(_tensor(here, probes, scales, patch)))
+
+        return np.array(list(pool.map(read, range(len(probes.seeds)))))
 
 
 class _Distinct:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CloudFrame", "is_scene", "patch_scales"]
+__all__ = ["CloudFrame", "is_scene", "patch_scales", "zoom_of"]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st and 99th percentile of
 # punet_train.npz at 10K to 50K points (docs/training.md says how they were measured).
@@ -15,6 +15,9 @@ _SMALLEST_RADIUS, _LARGEST_RADIUS = 0.13, 0.58
 _USUAL_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
+# In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
+_SHOWN_NOISE = 0.024
+_SMALLEST_ZOOM, _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 0.8, 2.5, 0.65
 _BLOCK = 2**16  # rows whose distances are held at once
 
 
@@ -51,12 +54,24 @@ def is_scene(radii: npt.NDArray[np.float64]) -> bool:
     return float(np.median(radii)) < _SCENE_RADIUS
 
 
-def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool) -> npt.NDArray[np.float64]:
+def zoom_of(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
+    """Return the factor by which the first pass shows an object larger, for noise and patch radii in the unit ball.
+
+    Noise and thin walls look alike, and a patch alone does not tell how much noise its cloud has. With the noise of
+    every cloud brought to about one size, all else in a patch tells which it is (docs/training.md has the figures).
+    """
+    largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
+    return float(np.clip(_SHOWN_NOISE / max(noise_std, 1e-9), _SMALLEST_ZOOM, largest))
+
+
+def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1.0) -> npt.NDArray[np.float64]:
     """Return the factor that brings each patch of the unit-ball cloud to a size the network knows, (M,) float64.
 
-    Patches of an object sampled like the training clouds keep their size: then this is the paper's frame. Those of a
-    scene are brought to the usual size, or keep a larger one (docs/training.md says why not to the nearest that was
-    seen). Patches larger than any in training are shrunk to the largest. One of radius 0 keeps the factor 1.
+    Patches of an object sampled like the training clouds are shown `zoom` times their size: at 1 this is the paper's
+    frame. Those of a scene are brought to the usual size, or keep a larger one (docs/training.md says why not to the
+    nearest that was seen). Patches that would be smaller or larger than any in training are brought to these limits,
+    the upper one zoomed. One of radius 0 keeps the factor 1.
     """
-    wanted = np.clip(radii, _USUAL_RADIUS if scene else _SMALLEST_RADIUS, _LARGEST_RADIUS)
+    largest = max(1.0, zoom) * _LARGEST_RADIUS
+    wanted = np.clip(zoom * radii, _USUAL_RADIUS if scene else _SMALLEST_RADIUS, largest)
     return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -16,7 +16,7 @@ from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "passes", "trace"]
+__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "noise_table", "passes", "trace"]
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
@@ -50,13 +50,32 @@ def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std:
     return Trace(name, noise_std, tuple(run.distances), chamfer)
 
 
-def calibrate(traces: Sequence[Trace]) -> Calibration:
-    """Read the table of noise levels off recorded traces, and choose the limits of `auto` by replaying them."""
-    levels = sorted({t.noise_std for t in traces})
-    table = _rising([(np.median([t.distances[0] for t in traces if t.noise_std == s]), s) for s in levels])
-    known = Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
+def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
+    """Read d of clean unit-sphere clouds (N, 3) with known noise: what a filter must know before it can be traced."""
+    readings = []
+    for clean in clouds.values():
+        for std in NOISE_LEVELS:
+            run = Run(filter_, clean + std * np.random.default_rng(seed).standard_normal(clean.shape), DenoiseOptions())
+            next(run.patches())  # d is read before the first patch is done
+            readings.append((std, run.distances[0]))
+    return _with_table(readings)
+
+
+def calibrate(traces: Sequence[Trace], table: Calibration | None = None) -> Calibration:
+    """Choose the limits of `auto` by replaying recorded traces.
+
+    table: whose table of noise levels to keep; without one it is read off the traces.
+    """
+    known = table or _with_table([(t.noise_std, t.distances[0]) for t in traces])
     choices = [replace(known, **dict(zip(_LIMITS, limits, strict=True))) for limits in product(*_LIMITS.values())]
     return min(choices, key=lambda choice: loss(choice, traces))
+
+
+def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
+    """Take the median d of each noise std."""
+    levels = sorted({std for std, _ in readings})
+    table = _rising([(float(np.median([d for s, d in readings if s == std])), std) for std in levels])
+    return Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
 
 
 def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:

@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Average", "load_state", "read_network", "save_state", "take_distance_module"]
+__all__ = ["Average", "average_with", "load_state", "read_network", "save_state", "take_distance_module"]
 
 
 class Average:
@@ -90,6 +90,19 @@ def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
 def take_distance_module(network: StraightPCF, path: Path) -> None:
     """Give a network the averaged DistanceModule of a run's state."""
     network.distance_module.load_state_dict(read_network(path)[0].distance_module.state_dict())
+
+
+def average_with(network: StraightPCF, path: Path) -> None:
+    """Replace a network's velocities by the mean of theirs and those of a state that was trained on from them.
+
+    Such means keep some of what each is better at (Wortsman et al. 2022, "Model soups"). BatchNorm's statistics are
+    averaged too: settled runs leave them as they were.
+    """
+    theirs = read_network(path)[0].velocity_modules.state_dict()
+    ours = network.velocity_modules.state_dict()
+    network.velocity_modules.load_state_dict(
+        {name: torch.lerp(t, theirs[name], 0.5) if t.is_floating_point() else t for name, t in ours.items()}
+    )
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -152,6 +154,23 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
         tiny.denoise(noisy(torus(5000), 0.01), DenoiseOptions(iterations=3), on_progress=stop)
     assert seen == sorted(seen)
     assert len(seen) == 3
+
+
+@pytest.mark.parametrize(("far", "zooms"), [(0.0, 1), (100.0, 0)])  # an object; one far beside a stray point: a scene
+def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
+    shipped: Filter, monkeypatch: pytest.MonkeyPatch, far: float, zooms: int
+) -> None:
+    seen: list[float] = []
+
+    def zoom(noise_std: float, radii: Any) -> float:
+        seen.append(noise_std)
+        return 1.0
+
+    monkeypatch.setattr("straightpcf.model.filter.zoom_of", zoom)
+    cloud = np.concatenate([noisy(torus(3000), 0.02), [[far, 0, 0]]])
+    shipped.denoise(cloud, DenoiseOptions(iterations=2))
+    assert len(seen) == zooms
+    assert all(0.015 < noise < 0.03 for noise in seen)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

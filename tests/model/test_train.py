@@ -16,7 +16,7 @@ from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch,
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision, velocity_loss
 from straightpcf.model.train.soap import SOAP
-from straightpcf.model.train.state import read_network
+from straightpcf.model.train.state import average_with, read_network
 from straightpcf.model.train.team import Team
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import InvalidOptions
@@ -255,6 +255,18 @@ def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: P
     joined = weights(run("cvm", "joined", coupled, distance=other))
     theirs = {name: tensor for name, tensor in weights(other).items() if name.startswith("distance_module")}
     assert same(theirs, joined)
+
+
+def test_the_mean_of_two_states_is_taken_weight_for_weight(velocity_run: Path) -> None:
+    torch.manual_seed(1)
+    network = StraightPCF(couplings=1)
+    ours = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    theirs = weights(velocity_run)
+    average_with(network, velocity_run)
+    for name, mean in network.state_dict().items():
+        both = (ours[name] + theirs[name]) / 2 if name.startswith("velocity") else ours[name]
+        if mean.is_floating_point():
+            torch.testing.assert_close(mean, both)
 
 
 def test_processes_share_a_batch_and_the_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:
