@@ -83,7 +83,7 @@ def main() -> None:
             take_distance_module(network, arguments.distance)
         if len(network.velocity_modules) == 1:  # as a stack of copies
             network.velocity_modules.append(copy.deepcopy(network.velocity_modules[0]))
-        model = Filter(network, threads=arguments.threads)
+        model = Filter(network, threads=arguments.threads, zoom=False)  # every pass here is a first one
         for noise in arguments.noise:
             rows = np.zeros((arguments.passes, 3))
             for truth in truths:

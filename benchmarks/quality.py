@@ -109,7 +109,7 @@ def _runner(options: argparse.Namespace) -> Run:
             raise SystemExit("--model official takes the authors' single VelocityModule")
         network = StraightPCF(couplings=1)
         network.velocity_modules[0] = module
-        model = Filter(_without_distance(network), threads=options.threads, euler_steps=OFFICIAL_STEPS)
+        model = Filter(_without_distance(network), threads=options.threads, euler_steps=OFFICIAL_STEPS, zoom=False)
     else:
         model = _ours(options)
     told = options.iterations == "told" or (options.iterations == "auto" and options.model == "official")
@@ -124,7 +124,8 @@ def _runner(options: argparse.Namespace) -> Run:
 
 def _ours(options: argparse.Namespace) -> Filter:
     if options.weights and _is_training_state(options.weights):
-        model = Filter(read_network(options.weights)[0], device="cpu", threads=options.threads)
+        network, _ = read_network(options.weights)
+        model = Filter(network, calibration=load_filter(device="cpu").calibration, threads=options.threads)
     else:
         model = load_filter(options.weights, device=options.device, threads=options.threads)
     model.euler_steps = options.euler_steps or model.euler_steps
@@ -133,6 +134,7 @@ def _ours(options: argparse.Namespace) -> Filter:
         model.full_evaluations = model.euler_steps * len(model.network.velocity_modules)
     if options.without_distance:
         _without_distance(model.network)
+        model.zoom = False  # d tells no noise
     return model
 
 

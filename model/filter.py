@@ -128,11 +128,13 @@ class Filter:
         euler_steps: int = EULER_STEPS,
         full_evaluations: int = FULL_EVALUATIONS,
         even: bool = True,
+        zoom: bool = True,
         tile_points: int | None = None,
     ) -> None:
         """Put a network between the stages.
 
-        even: between passes, points are spread along the surface (`spread`).
+        even: between passes, points are spread along the surface (`spread`). zoom: the first pass shows an object in
+        the size of its noise (`zoom_of`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """
@@ -147,6 +149,7 @@ class Filter:
         self.euler_steps = euler_steps
         self.full_evaluations = full_evaluations
         self.even = even
+        self.zoom = zoom
         self.turns = turns(_TURNS).to(device)
         self.on_device = None if device == "cpu" else OnDevice(self.forward, self.network.distance_module, device)
         keep_large_buffers()
@@ -330,7 +333,7 @@ class Run:
         distances = self._read(here, probes, scales, pool)
         self.distances.append(float(np.median(distances)))
         noise = float(np.median(self.filter.calibration.noise_std(distances) / scales))
-        if self.iterations == 0 and not self.scene:
+        if self.iterations == 0 and self.filter.zoom and not self.scene:
             self.zoom = zoom_of(noise, probes.radii)
             distances = self._read(here, probes, patch_scales(probes.radii, scene=False, zoom=self.zoom), pool)
         self.probed = dict(zip(numbers, distances.tolist(), strict=False))
