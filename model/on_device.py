@@ -10,6 +10,7 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
 import numpy as np
@@ -119,8 +120,9 @@ class OnDevice:
         while first < len(cut.seeds):
             chosen = range(first, min(first + self.batch, len(cut.seeds)))
             try:
-                moves = self._launch(points, cut, scales, probed, chosen)
-                waiting.append((chosen, _Result(moves[: len(chosen)])))
+                with self._current():
+                    moves = self._launch(points, cut, scales, probed, chosen)
+                    waiting.append((chosen, _Result(moves[: len(chosen)])))
             except torch.OutOfMemoryError as exc:
                 if self.batch == 1:
                     raise TooLarge(f"{self.device} has no memory for a patch of {cut.index.shape[1]} points") from exc
@@ -139,7 +141,8 @@ class OnDevice:
         """Return what the DistanceModule says of each patch: (M,)."""
         points = torch.from_numpy(here).to(self.device)
         batches = (np.arange(len(cut.seeds))[i : i + self.batch] for i in range(0, len(cut.seeds), self.batch))
-        found = [self._distances(_patches(points, cut, scales, batch)) for batch in batches]
+        with self._current():
+            found = [self._distances(_patches(points, cut, scales, batch)) for batch in batches]
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
@@ -156,12 +159,17 @@ class OnDevice:
                 index, owned = (torch.from_numpy(part[batch]).to(self.device) for part in (cut.index, cut.owned))
                 rows = max(1, int(cut.owned[batch].max()))
                 patch, row = (torch.arange(rows, device=self.device) < owned[:, None]).nonzero(as_tuple=True)
-                found = knn(x, nearest, rows)[patch, row].long()  # (n, k), in any order
+                with self._current():
+                    found = knn(x, nearest, rows)[patch, row].long()  # (n, k), in any order
                 far = (x[patch[:, None], found] - x[patch, row][:, None]).square().sum(dim=2)
                 found = found.gather(1, far.argsort(dim=1))
                 around[index[patch, row].long()] = index[patch[:, None], found]
         moved: Floats = spread_among(points, around, limit).cpu().numpy()
         return moved
+
+    def _current(self) -> AbstractContextManager[object]:
+        """Make the device torch's current one: Triton and captures work on no other."""
+        return torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
 
     @torch.inference_mode()
     def _launch(
