@@ -21,7 +21,7 @@ from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales, zoom_of
-from straightpcf.model.on_device import OnDevice
+from straightpcf.model.on_device import OnDevice, cut_out
 from straightpcf.model.patches import Patches
 from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling, split
@@ -151,7 +151,7 @@ class Filter:
         self.even = even
         self.zoom = zoom
         self.turns = turns(_TURNS).to(device)
-        self.on_device = None if device == "cpu" else OnDevice(self.forward, self.network.distance_module, device)
+        self.on_device = None if device == "cpu" else OnDevice(self.forward, self.distance, device)
         keep_large_buffers()
 
     def forward(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
@@ -169,6 +169,11 @@ class Filter:
             turns=self.turns,
         )[0]
         return moved - x[:, :rows]
+
+    def distance(self, x: torch.Tensor) -> torch.Tensor:
+        """Return what the DistanceModule says of patches (B, P, 3) float32: (B, 1)."""
+        distance: torch.Tensor = self.network.distance_module(x)
+        return distance
 
     def denoise(
         self,
@@ -311,11 +316,13 @@ class Run:
             yield from self.filter.on_device.displacements(here, cut, scales, self.probed)
             return
 
+        points = torch.from_numpy(here)
+
         def move(patch: int) -> npt.NDArray[np.float64]:
             known = self.probed.get(patch)
             distance = None if known is None else torch.tensor([[known]])
             owned = int(cut.owned[patch])
-            x = _tensor(here, cut, scales, patch)
+            x = cut_out(points, cut, scales, np.array([patch]))
             return self.filter.forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned].double().numpy()
 
         results = _bounded_map(pool, move, range(len(cut.seeds)), ahead=2 * self.filter.threads)
@@ -335,6 +342,7 @@ class Run:
         noise = float(np.median(self.filter.calibration.noise_std(distances) / scales))
         if self.iterations == 0 and self.filter.zoom and not self.scene:
             self.zoom = zoom_of(noise, probes.radii)
+        if self.zoom != 1.0:
             distances = self._read(here, probes, patch_scales(probes.radii, scene=False, zoom=self.zoom), pool)
         self.probed = dict(zip(numbers, distances.tolist(), strict=False))
         return noise
@@ -346,9 +354,11 @@ class Run:
         if self.filter.on_device is not None:
             return self.filter.on_device.distances(here, probes, scales)
 
+        points = torch.from_numpy(here)
+
         def read(patch: int) -> float:
             with torch.inference_mode():
-                return float(self.filter.network.distance_module(_tensor(here, probes, scales, patch)))
+                return float(self.filter.distance(cut_out(points, probes, scales, np.array([patch]))))
 
         return np.array(list(pool.map(read, range(len(probes.seeds)))))
 
@@ -386,12 +396,6 @@ def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
         hashed ^= (xyz[:, axis] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
     hashed.sort()
     return bool((hashed[1:] == hashed[:-1]).any())
-
-
-def _tensor(here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], patch: int) -> torch.Tensor:
-    """Cut one patch out of the points, centred on its seed: (1, P, 3) float32."""
-    local = (here[cut.index[patch]] - here[cut.seeds[patch]]) * scales[patch]
-    return torch.from_numpy(local[None].astype(np.float32))
 
 
 def _one_thread() -> None:

@@ -22,7 +22,7 @@ from straightpcf.model.patches import PATCH_SIZE, Patches
 from straightpcf.model.spread import AROUND, spread_among
 from straightpcf.points.errors import TooLarge
 
-__all__ = ["Capture", "Forward", "Graphs", "OnDevice", "capture_cuda_graph"]
+__all__ = ["Capture", "Forward", "Graphs", "OnDevice", "capture_cuda_graph", "cut_out"]
 
 Floats = npt.NDArray[np.float64]
 # x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
@@ -45,7 +45,7 @@ def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], ob
 
 
 class Graphs:
-    """A Forward replayed as a graph from the third time on that a full patch's shape comes.
+    """A Forward replayed as a graph from the second time on that a shape of full patches comes.
 
     A velocity evaluation is some forty kernels of a few microseconds; launching each takes the host as long. The first
     call of a shape compiles and sets up what a capture must not; where capturing fails, all goes on without graphs.
@@ -142,7 +142,7 @@ class OnDevice:
         points = torch.from_numpy(here).to(self.device)
         batches = (np.arange(len(cut.seeds))[i : i + self.batch] for i in range(0, len(cut.seeds), self.batch))
         with self._current():
-            found = [self._distances(_patches(points, cut, scales, batch)) for batch in batches]
+            found = [self._distances(cut_out(points, cut, scales, batch)) for batch in batches]
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
@@ -155,7 +155,7 @@ class OnDevice:
         for cut in cuts:
             for first in range(0, len(cut.seeds), self.batch):
                 batch = np.arange(first, min(first + self.batch, len(cut.seeds)))
-                x = _patches(points, cut, np.ones(len(cut.seeds)), batch)
+                x = cut_out(points, cut, np.ones(len(cut.seeds)), batch)
                 index, owned = (torch.from_numpy(part[batch]).to(self.device) for part in (cut.index, cut.owned))
                 rows = max(1, int(cut.owned[batch].max()))
                 patch, row = (torch.arange(rows, device=self.device) < owned[:, None]).nonzero(as_tuple=True)
@@ -182,7 +182,7 @@ class OnDevice:
         distance = torch.tensor(known, device=self.device)[:, None] if len(known) == len(batch) else None
         owned = torch.from_numpy(cut.owned[batch]).to(self.device)
         rows = max(1, int(cut.owned[batch].max()))
-        return self._graphs(_patches(points, cut, scales, batch), owned, distance, rows)
+        return self._graphs(cut_out(points, cut, scales, batch), owned, distance, rows)
 
 
 class _Result:
@@ -201,7 +201,7 @@ class _Result:
         return self._host.numpy()
 
 
-def _patches(points: torch.Tensor, cut: Patches, scales: Floats, batch: npt.NDArray[np.int64]) -> torch.Tensor:
+def cut_out(points: torch.Tensor, cut: Patches, scales: Floats, batch: npt.NDArray[np.int64]) -> torch.Tensor:
     """Cut some patches out of the points, centred on their seeds: (B, P, 3) float32, on the points' device."""
     index, seeds, scale = (
         torch.from_numpy(part[batch]).to(points.device) for part in (cut.index, cut.seeds, scales)

@@ -37,8 +37,7 @@ def on_device(
     network: torch.nn.Module, *, batch: int = 4, capture: Capture = capture_by_calling, tile_points: int | None = None
 ) -> Filter:
     model = Filter(network, threads=1, coverage=3, tile_points=tile_points)  # type: ignore[arg-type]
-    distances: Any = network.distance_module
-    model.on_device = OnDevice(model.forward, distances, "cpu", batch=batch, capture=capture)
+    model.on_device = OnDevice(model.forward, model.distance, "cpu", batch=batch, capture=capture)
     return model
 
 

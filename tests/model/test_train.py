@@ -44,6 +44,13 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
+def drawn(source: PatchSource, count: int, *, on_device: bool) -> Batch:
+    if not on_device:
+        return source.draw(np.random.default_rng(0), count)
+    torch.manual_seed(0)
+    return DevicePatchSource(source, torch.device("cpu")).draw(count)
+
+
 def test_training_shapes_and_validation_shapes_are_disjoint(data: Path) -> None:
     parts = [PatchSource.read(data, validation=v) for v in (False, True)]
     clouds = [{cloud.tobytes() for cloud in part.clouds} for part in parts]
@@ -78,9 +85,7 @@ def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
     # A patch of a plane cut at x_t is a disc: 0.81 of its points lie within 0.9 of its radius, however late t is.
     plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
     source = PatchSource([[plane]])
-    torch.manual_seed(0)
-    device = torch.device("cpu")
-    batch = DevicePatchSource(source, device).draw(64) if on_device else source.draw(np.random.default_rng(0), 64)
+    batch = drawn(source, 64, on_device=on_device)
     reach = batch.at(batch.time).norm(dim=2)
     within = (reach < 0.9 * reach.amax(dim=1, keepdim=True)).float().mean(dim=1)
     late = batch.time.flatten() > 0.7
@@ -90,9 +95,7 @@ def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
 @pytest.mark.parametrize("on_device", [False, True])
 def test_paths_are_taken_up_before_their_start_too(data: Path, *, on_device: bool) -> None:
     source = PatchSource.read(data)
-    torch.manual_seed(0)
-    device = torch.device("cpu")
-    batch = DevicePatchSource(source, device).draw(64) if on_device else source.draw(np.random.default_rng(0), 64)
+    batch = drawn(source, 64, on_device=on_device)
     assert EARLIEST <= batch.time.min() < 0.7 * EARLIEST
     assert 0.9 < batch.time.max() < 1
     noise = (batch.at(batch.time) - batch.clean).std(dim=(1, 2)) / (1 - batch.time.flatten())
@@ -138,9 +141,7 @@ def test_noisy_points_are_led_to_the_surface_and_not_beneath_it() -> None:
 @pytest.mark.parametrize("on_device", [False, True])
 def test_most_points_of_the_loss_are_near_the_seed(data: Path, *, on_device: bool) -> None:
     source = PatchSource.read(data)
-    torch.manual_seed(0)
-    device = torch.device("cpu")
-    batch = DevicePatchSource(source, device).draw(16) if on_device else source.draw(np.random.default_rng(0), 16)
+    batch = drawn(source, 16, on_device=on_device)
     rank = batch.at(batch.time).norm(dim=2).argsort(dim=1).argsort(dim=1)
     assert (rank[:, :256] < PATCH_SIZE // 2).float().mean() == pytest.approx(0.88, abs=0.03)
     assert (rank[:, :256] >= PATCH_SIZE // 2).any()
