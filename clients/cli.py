@@ -233,7 +233,7 @@ def version() -> None:
 @app.command()
 def train(
     stage: Annotated[Stage, typer.Argument(help="vm: one velocity module; cvm: the coupled stack; dm: the distance.")],
-    data: Annotated[Path, typer.Option(help="Clean clouds, one NPZ.")],
+    data: Annotated[list[Path], typer.Option(help="Clean clouds, an NPZ; may be given again.")],
     run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that is found there is resumed.")],
     iterations: Annotated[int, typer.Option(min=1)] = 20_000,
     batch_size: Annotated[int, typer.Option(min=1)] = 16,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,13 +13,15 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.normalize import CloudFrame, zoom_of
 from straightpcf.model.normals import recompute_normals
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = [
     "CANDIDATES",
     "EARLIEST",
+    "FIRST_NOISE",
+    "FIRST_PASSES",
     "NEAR_SHARE",
     "NEAR_WEIGHT",
     "NOISE_STD",
@@ -34,9 +36,15 @@ __all__ = [
 ]
 
 PATCH_SIZE = 1000
-NOISE_STD = 0.02  # of x_0, in radii of the cloud's bounding sphere
+NOISE_STD = 0.02  # of x_0, in the frame in which the network sees a patch
 EARLIEST = -0.5  # paths are taken up at times from here to 1: x_t has noise from 3 % down
 SCALES = (0.8, 1.2)  # augmentation
+# The share of patches shown as the first pass of the filter shows them: with noise of 0 to 3 % of the cloud's radius,
+# in the size that goes with it (`zoom_of`). The others are shown as later passes see them, with t in [0, 1).
+FIRST_PASSES = 0.5
+# Their noise, in radii of the cloud's bounding sphere.
+FIRST_NOISE = 0.03 * (np.arange(60) + 0.5) / 60
+_RADII = 200  # patches of a cloud that are measured
 # Every tenth shape by name stays out of training, so that there is something honest to choose by.
 VALIDATION_EVERY = 10
 # Noise moves points in and out of a patch: the noisy patch is chosen among this many clean neighbours. Of a patch of
@@ -105,33 +113,58 @@ def held_out_shapes(names: Iterable[str]) -> set[str]:
 class PatchSource:
     """Draw patches from clean clouds, each in the frame where its bounding sphere has radius 1."""
 
-    def __init__(self, shapes: list[list[npt.NDArray[np.float32]]]) -> None:
-        """Take the clouds of each shape, in one frame; the one of most points is taken for its surface."""
+    def __init__(
+        self,
+        shapes: list[list[npt.NDArray[np.float32]]],
+        normals: Sequence[npt.NDArray[np.float32] | None] | None = None,
+    ) -> None:
+        """Take the clouds of each shape, in one frame; the one of most points is taken for its surface.
+
+        normals: those of the clouds of most points, (M, 3); None where they are to be computed.
+        """
         if not shapes:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
         self.clouds: list[npt.NDArray[np.float64]] = []
         self.surfaces: list[Surface] = []
-        for shape in shapes:
+        for shape, given in zip(shapes, normals or [None] * len(shapes), strict=True):
             finest = max(shape, key=len).astype(np.float64)
-            normals = recompute_normals(finest, np.zeros_like(finest))
+            across = given.astype(np.float64) if given is not None else recompute_normals(finest, 0 * finest)
             for cloud in shape:
                 wide = cloud.astype(np.float64)
                 frame = CloudFrame.of(wide)
                 self.clouds.append(frame.enter(wide))
-                self.surfaces.append(Surface(frame.enter(finest), normals))
+                self.surfaces.append(Surface(frame.enter(finest), across))
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
+        self.zooms = np.stack([self._zooms(cloud, tree) for cloud, tree in zip(self.clouds, self._trees, strict=True)])
+
+    @staticmethod
+    def _zooms(cloud: npt.NDArray[np.float64], tree: cKDTree) -> npt.NDArray[np.float64]:
+        """Return the zoom of a first pass over a cloud (N, 3) for each of `FIRST_NOISE`."""
+        some = cloud[:: max(1, len(cloud) // _RADII)]
+        radii = tree.query(some, k=[min(PATCH_SIZE, len(cloud))])[0][:, 0]
+        return np.array([zoom_of(std, radii) for std in FIRST_NOISE])
 
     @classmethod
-    def read(cls, path: Path, *, validation: bool = False) -> PatchSource:
-        """Read an .npz of clean clouds named `<shape>/<resolution>`: the training shapes, or the held-out ones."""
-        with np.load(path, allow_pickle=False) as archive:
-            held_out = held_out_shapes(archive.files)
-            shapes: dict[str, list[npt.NDArray[np.float32]]] = {}
-            for name in archive.files:
-                shape = name.split("/")[0]
-                if (shape in held_out) == validation:
-                    shapes.setdefault(shape, []).append(archive[name])
-            return cls(list(shapes.values()))
+    def read(cls, *paths: Path, validation: bool = False) -> PatchSource:
+        """Read the training shapes of .npz files, or the held-out ones, of each file every tenth.
+
+        Clean clouds (N, 3) are named `<shape>/<resolution>`; with them may be `<shape>/normals`, the unit normals of
+        the one of most points.
+        """
+        shapes: dict[tuple[Path, str], list[npt.NDArray[np.float32]]] = {}
+        normals: dict[tuple[Path, str], npt.NDArray[np.float32]] = {}
+        for path in paths:
+            with np.load(path, allow_pickle=False) as archive:
+                held_out = held_out_shapes(archive.files)
+                for name in archive.files:
+                    shape, what = name.split("/")
+                    if (shape in held_out) != validation:
+                        continue
+                    if what == "normals":
+                        normals[path, shape] = archive[name]
+                    else:
+                        shapes.setdefault((path, shape), []).append(archive[name])
+        return cls(list(shapes.values()), [normals.get(key) for key in shapes])
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""
@@ -145,15 +178,19 @@ class PatchSource:
         seed = cloud[rng.integers(len(cloud))]
         _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
         clean = cloud[near]  # row 0 is the seed
-        time = rng.uniform(EARLIEST, 1)
-        here = clean + (1 - time) * NOISE_STD * rng.standard_normal(clean.shape)
+        scale = rng.uniform(*SCALES) if augment else 1.0
+        if rng.random() < FIRST_PASSES:
+            level = rng.integers(len(FIRST_NOISE))
+            scale *= self.zooms[which, level]
+            time = max(EARLIEST, 1 - scale * FIRST_NOISE[level] / NOISE_STD)
+        else:
+            time = rng.uniform(0, 1)
+        here = clean + (1 - time) * NOISE_STD / scale * rng.standard_normal(clean.shape)
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
         distance = np.square(here - origin).sum(axis=1)
         inside = np.argsort(distance)[:PATCH_SIZE]
-        transform = np.eye(3)
-        if augment:
-            transform = Rotation.random(random_state=rng).as_matrix() * rng.uniform(*SCALES)
+        transform = scale * (Rotation.random(random_state=rng).as_matrix() if augment else np.eye(3))
         # A weighted draw without replacement: the smallest of exponential variables (Efraimidis and Spirakis 2006).
         turn = rng.exponential(size=PATCH_SIZE)
         turn[: int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT

@@ -9,6 +9,8 @@ import torch
 from straightpcf.model.train.data import (
     CANDIDATES,
     EARLIEST,
+    FIRST_NOISE,
+    FIRST_PASSES,
     NEAR_SHARE,
     NEAR_WEIGHT,
     NOISE_STD,
@@ -36,6 +38,8 @@ class DevicePatchSource:
         self._counts = torch.tensor([len(cloud) for cloud in source.clouds], device=device)
         self._candidates = min([CANDIDATES, *map(len, source.clouds)])
         self._clouds = _padded(source.clouds, device)
+        self._noise = torch.from_numpy(FIRST_NOISE).float().to(device)
+        self._zooms = torch.from_numpy(source.zooms).float().to(device)
         self._surfaces = _padded([surface.xyz for surface in source.surfaces], device)
         self._normals = _padded([surface.normals for surface in source.surfaces], device)
 
@@ -48,8 +52,8 @@ class DevicePatchSource:
         squared = (clouds - clouds.gather(1, _rows(seeds[:, None]))).square().sum(dim=2)
         near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
         clean = clouds.gather(1, _rows(near))
-        noisy = clean + NOISE_STD * torch.randn_like(clean)
-        time = torch.empty(batch_size, 1, 1, device=device).uniform_(EARLIEST, 1)
+        time, scale = self._shown(which)
+        noisy = clean + NOISE_STD / scale * torch.randn_like(clean)
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
         squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does
@@ -62,9 +66,18 @@ class DevicePatchSource:
         clean = torch.where(early, self.touching(which, here, clean), clean)
         # Late in time x_0 stays as drawn: float32 cannot find it again from x_t.
         noisy = torch.where(early, torch.lerp(clean, here, 1 / (1 - time)), noisy)
-        scale = torch.empty(batch_size, 1, 1, device=device).uniform_(*SCALES)
         transform = random_rotations(batch_size, device) * scale
         return Batch((noisy - origin) @ transform, (clean - origin) @ transform, time)
+
+    def _shown(self, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw the times and sizes, (B, 1, 1), in which patches of the clouds numbered `which` (B,) are shown."""
+        first, time, scale = torch.rand(3, len(which), device=which.device)
+        scale = SCALES[0] + (SCALES[1] - SCALES[0]) * scale
+        level = torch.randint(len(self._noise), which.shape, device=which.device)
+        zoomed = scale * self._zooms[which, level]
+        early = first < FIRST_PASSES
+        time = torch.where(early, (1 - zoomed * self._noise[level] / NOISE_STD).clamp(min=EARLIEST), time)
+        return time.view(-1, 1, 1), torch.where(early, zoomed, scale).view(-1, 1, 1)
 
     def touching(self, which: torch.Tensor, here: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
         """Do for (B, P, 3) points of the clouds numbered `which` (B,) what `Surface.touching` does."""

@@ -6,7 +6,7 @@ import copy
 import csv
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -53,7 +53,7 @@ class TrainStep:
 def train(
     stage: Stage,
     *,
-    data: Path,
+    data: Path | Sequence[Path],
     run_dir: Path,
     iterations: int,
     batch_size: int = 16,
@@ -73,6 +73,7 @@ def train(
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
+    data: the archives of clean clouds (`PatchSource.read`), which a run that goes on may change.
     init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage.
     distance: a state whose DistanceModule to start from instead. rows: points of a patch in the loss. settled: without
     dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
@@ -84,6 +85,7 @@ def train(
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
+    archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)
     keep_large_buffers()
@@ -102,7 +104,7 @@ def train(
     average = Average(network, _EMA_DECAY)
     start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
-    source = PatchSource.read(data)
+    source = PatchSource.read(*archives)
     stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
     if stage == "cvm":
         stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
@@ -110,13 +112,14 @@ def train(
     share = batch_size // processes
     team = None
     if processes > 1:
-        team = Team(processes - 1, network, trained, stage_loss, data, share, (seed, start))
+        team = Team(processes - 1, network, trained, stage_loss, archives, share, (seed, start))
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"
         else HostStep(source, loss_of, trained, optimiser, rng, share, team)
     )
-    fixed = PatchSource.read(data, validation=True).draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
+    held_out = PatchSource.read(*archives, validation=True)
+    fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
     validation: float | None = None
     with (run_dir / "log.csv").open("a", newline="") as file, team or nullcontext():

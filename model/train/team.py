@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Self
@@ -32,7 +32,7 @@ class Team:
         network: StraightPCF,
         trained: torch.nn.Module,
         loss: NetworkLoss,
-        data: Path,
+        data: Sequence[Path],
         batch_size: int,
         seed: tuple[int, ...],
     ) -> None:
@@ -92,7 +92,7 @@ def _work(
     trained: torch.nn.Module,
     loss_of: NetworkLoss,
     gradient: torch.Tensor,
-    data: Path,
+    data: Sequence[Path],
     batch_size: int,
     seed: tuple[int, ...],
 ) -> None:
@@ -100,7 +100,7 @@ def _work(
     keep_large_buffers()
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**62)))  # dropout
-    source = PatchSource.read(data)
+    source = PatchSource.read(*data)
     try:
         while True:
             trained.train(pipe.recv())

@@ -102,6 +102,19 @@ def test_paths_are_taken_up_before_their_start_too(data: Path, *, on_device: boo
     assert ((noise > 0.015) & (noise < 0.025)).all()
 
 
+@pytest.mark.parametrize("on_device", [False, True])
+def test_half_of_the_patches_are_in_the_sizes_of_a_first_pass(*, on_device: bool) -> None:
+    # Of this plane 1000 points lie within 0.18 radii of it; a first pass shows that up to 2.5 times larger.
+    plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
+    batch = drawn(PatchSource([[plane]]), 64, on_device=on_device)
+    here, time = batch.at(batch.time), batch.time.flatten()
+    noise = (here - batch.clean).std(dim=(1, 2))
+    assert ((noise - NOISE_STD * (1 - time)).abs() < 0.2 * noise).all()  # whatever the size
+    larger = here.norm(dim=2).quantile(0.9, dim=1) / 0.18
+    assert 0.1 < (larger > 1.4).float().mean() < 0.5
+    assert 0.15 < (time < 0).float().mean() < 0.5  # first passes alone have more than NOISE_STD
+
+
 def test_one_pass_is_asked_to_go_no_farther_than_it_can() -> None:
     network = StraightPCF(couplings=2).eval()
     clean = 0.1 * torch.randn(2, 100, 3)
@@ -286,7 +299,7 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
     network = StraightPCF(couplings=1).eval()
     trained = network.velocity_modules
     loss_of = partial(velocity_loss, rows=64)
-    team = Team(1, network, trained, loss_of, data, 2, (7,))
+    team = Team(1, network, trained, loss_of, [data], 2, (7,))
     source = PatchSource.read(data)
     ours = source.draw(np.random.default_rng(8), 2)
 

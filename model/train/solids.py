@@ -1,0 +1,334 @@
+"""Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, with exact normals.
+
+python -m straightpcf.model.train.solids solids.npz --count 24
+
+Thin walls are what a denoiser takes for noise, and PUNet's training split has few of them. A solid is a union of parts
+less a union of holes; its surface is sampled exactly, part by part, with no mesh in between.
+"""
+
+from __future__ import annotations
+
+import argparse
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import fpsample
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from straightpcf.model.normalize import CloudFrame
+
+__all__ = ["FAMILIES", "RESOLUTIONS", "Box", "Cylinder", "Ellipsoid", "Solid", "write_solids"]
+
+Floats = npt.NDArray[np.float64]
+Samples = tuple[Floats, Floats]  # points (N, 3) and their unit normals (N, 3)
+
+RESOLUTIONS = (10_000, 30_000, 50_000)
+# Of so many times the points wanted, the farthest from each other are kept: spacings are then as even as PUNet's (the
+# nearest neighbour's distance varies by 10 %).
+_CANDIDATES = 10
+_WALL = (0.05, 0.25)  # thickness, in a frame where solids have a radius of about 2: 0.025 to 0.12 in radii
+
+
+@dataclass(frozen=True)
+class _Primitive(ABC):
+    """A convex body in a pose of its own."""
+
+    centre: Floats = field(default_factory=lambda: np.zeros(3))
+    turn: Floats = field(default_factory=lambda: np.eye(3))  # columns: the body's axes
+
+    def surface(self, rng: np.random.Generator, density: float) -> Samples:
+        """Sample the boundary evenly, `density` points a unit of area."""
+        xyz, normals = self._surface(rng, density)
+        return xyz @ self.turn.T + self.centre, normals @ self.turn.T
+
+    def contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        """Say which points (N, 3) are inside: (N,)."""
+        return self._contains((xyz - self.centre) @ self.turn)
+
+    @abstractmethod
+    def _surface(self, rng: np.random.Generator, density: float) -> Samples: ...
+
+    @abstractmethod
+    def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]: ...
+
+
+@dataclass(frozen=True)
+class Box(_Primitive):
+    """half: (3,) half its sides."""
+
+    half: Floats = field(default_factory=lambda: np.ones(3))
+
+    def _surface(self, rng: np.random.Generator, density: float) -> Samples:
+        points, normals = [], []
+        for axis in range(3):
+            others = [i for i in range(3) if i != axis]
+            for side in (-1.0, 1.0):
+                face = rng.uniform(-1, 1, (rng.poisson(density * 4 * np.prod(self.half[others])), 3))
+                face[:, axis] = side
+                points.append(face * self.half)
+                normals.append(np.broadcast_to(side * np.eye(3)[axis], face.shape))
+        return np.concatenate(points), np.concatenate(normals)
+
+    def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        return np.asarray((np.abs(xyz) < self.half).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Cylinder(_Primitive):
+    """Of a radius and half a height, along its z axis."""
+
+    radius: float = 1.0
+    half: float = 1.0
+
+    def _surface(self, rng: np.random.Generator, density: float) -> Samples:
+        around = rng.uniform(0, 2 * np.pi, rng.poisson(density * 4 * np.pi * self.radius * self.half))
+        out = np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=1)
+        points, normals = [self.radius * out], [out]
+        points[0][:, 2] = rng.uniform(-self.half, self.half, len(around))
+        for side in (-1.0, 1.0):
+            count = rng.poisson(density * np.pi * self.radius**2)
+            around, reach = rng.uniform(0, 2 * np.pi, count), self.radius * np.sqrt(rng.random(count))
+            disc = [reach * np.cos(around), reach * np.sin(around), np.full(count, side * self.half)]
+            points.append(np.stack(disc, axis=1))
+            normals.append(np.broadcast_to([0.0, 0.0, side], (count, 3)))
+        return np.concatenate(points), np.concatenate(normals)
+
+    def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        return (np.hypot(xyz[:, 0], xyz[:, 1]) < self.radius) & (np.abs(xyz[:, 2]) < self.half)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(_Primitive):
+    """half: (3,) its semi-axes."""
+
+    half: Floats = field(default_factory=lambda: np.ones(3))
+
+    def _surface(self, rng: np.random.Generator, density: float) -> Samples:
+        # A patch of the unit sphere grows by |h1 h2 h3| |n / h|, by this factor's bound at most: rejection.
+        bound = np.prod(self.half) / self.half.min()
+        ball = rng.standard_normal((rng.poisson(density * 4 * np.pi * bound), 3))
+        ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+        normals = ball / self.half
+        growth = np.linalg.norm(normals, axis=1)
+        kept = rng.random(len(ball)) < growth * self.half.min()
+        return ball[kept] * self.half, normals[kept] / growth[kept, None]
+
+    def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        return np.asarray(np.square(xyz / self.half).sum(axis=1) < 1)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A union of parts less a union of holes."""
+
+    parts: Sequence[_Primitive]
+    holes: Sequence[_Primitive] = ()
+
+    def contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        """Say which points (N, 3) are inside: (N,)."""
+        return self._in_any(xyz, self.parts) & ~self._in_any(xyz, self.holes)
+
+    def sample(self, rng: np.random.Generator, count: int) -> Samples:
+        """Sample about `count` points of the boundary, evenly."""
+        rough = len(self._at(rng, 200.0)[0]) / 200.0
+        return self._at(rng, count / rough)
+
+    def _at(self, rng: np.random.Generator, density: float) -> Samples:
+        points, normals = [], []
+        for part in self.parts:
+            xyz, outward = part.surface(rng, density)
+            shown = ~self._in_any(xyz, [*(p for p in self.parts if p is not part), *self.holes])
+            points.append(xyz[shown])
+            normals.append(outward[shown])
+        for hole in self.holes:
+            xyz, outward = hole.surface(rng, density)
+            shown = self._in_any(xyz, self.parts) & ~self._in_any(xyz, [h for h in self.holes if h is not hole])
+            points.append(xyz[shown])
+            normals.append(-outward[shown])
+        return np.concatenate(points), np.concatenate(normals)
+
+    @staticmethod
+    def _in_any(xyz: Floats, bodies: Sequence[_Primitive]) -> npt.NDArray[np.bool_]:
+        held = np.zeros(len(xyz), dtype=bool)
+        for body in bodies:
+            held |= body.contains(xyz)
+        return held
+
+
+def write_solids(path: Path, count: int, *, seed: int = 0) -> None:
+    """Write an .npz of `count` solids as PUNet's training split is written: `solid<number>/<resolution>`, float32.
+
+    With them their normals, `solid<number>/normals`, of the points at the finest resolution. All in the frame where the
+    bounding sphere has radius 1.
+    """
+    arrays = {}
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        # Every family in turn: as many of each.
+        xyz, normals = FAMILIES[number % len(FAMILIES)](rng).sample(rng, _CANDIDATES * max(RESOLUTIONS))
+        xyz = CloudFrame.of(xyz).enter(xyz)
+        for resolution in RESOLUTIONS:
+            some = rng.permutation(len(xyz))[: _CANDIDATES * resolution]
+            kept = some[fpsample.bucket_fps_kdline_sampling(xyz[some].astype(np.float32), resolution, 7, 0)]
+            arrays[f"solid{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
+        arrays[f"solid{number:03d}/normals"] = normals[kept].astype(np.float32)
+    np.savez_compressed(path, **arrays)
+
+
+def _wall(rng: np.random.Generator) -> float:
+    return float(np.exp(rng.uniform(*np.log(_WALL))))
+
+
+def _axes(rng: np.random.Generator, z: int) -> Floats:
+    """Return a pose whose z axis is one of the three, off by a little: no two faces shall coincide."""
+    turn = np.roll(np.eye(3), z + 1, axis=1)
+    small: Floats = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
+    return small @ turn
+
+
+def _along(direction: Floats) -> Floats:
+    """Return a pose whose z axis points along `direction`."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(z, [1.0, 0, 0] if abs(z[0]) < 0.9 else [0, 1.0, 0])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _bracket(rng: np.random.Generator) -> Solid:
+    """Two to four plates at right angles, with round holes."""
+    parts: list[_Primitive] = []
+    holes: list[_Primitive] = []
+    for _ in range(rng.integers(2, 5)):
+        axis = int(rng.integers(3))
+        half = rng.uniform(0.5, 1.3, 3)
+        half[2] = _wall(rng) / 2
+        turn, centre = _axes(rng, axis), rng.uniform(-0.7, 0.7, 3)
+        parts.append(Box(centre, turn, half))
+        for _ in range(rng.integers(0, 4)):
+            place = centre + turn @ (rng.uniform(-0.8, 0.8, 3) * half * [1, 1, 0])
+            holes.append(Cylinder(place, turn, rng.uniform(0.08, 0.35), 2 * half[2]))
+    return Solid(parts, holes)
+
+
+def _fins(rng: np.random.Generator) -> Solid:
+    """A base with parallel ribs: walls with gaps between them."""
+    thick, gap = _wall(rng), rng.uniform(0.1, 0.5)
+    count = int(np.clip(2.4 / (thick + gap), 3, 12))
+    width = count * (thick + gap) / 2
+    parts: list[_Primitive] = [Box(np.zeros(3), np.eye(3), np.array([width, rng.uniform(0.6, 1.4), _wall(rng) / 2]))]
+    for place in np.linspace(-width + thick, width - thick, count):
+        half = np.array([thick / 2, rng.uniform(0.4, 1.2), rng.uniform(0.3, 0.8)])
+        parts.append(Box(np.array([place, 0, half[2]]) + rng.normal(0, 0.01, 3), _axes(rng, 2), half))
+    return Solid(parts)
+
+
+def _pipes(rng: np.random.Generator) -> Solid:
+    """One to three tubes that cross, with flanges."""
+    parts: list[_Primitive] = []
+    holes: list[_Primitive] = []
+    for axis in rng.permutation(3)[: rng.integers(1, 4)]:
+        turn, centre = _axes(rng, int(axis)), rng.normal(0, 0.1, 3)
+        radius, half, wall = rng.uniform(0.25, 0.7), rng.uniform(0.9, 1.6), _wall(rng)
+        parts.append(Cylinder(centre, turn, radius, half))
+        holes.append(Cylinder(centre, turn, max(0.3 * radius, radius - wall), half + 0.1))
+        for side in (-1, 1):
+            if rng.random() < 0.6:
+                thick = _wall(rng)
+                end = centre + turn @ [0, 0, side * (half - thick)]
+                parts.append(Cylinder(end, turn, radius + rng.uniform(0.1, 0.4), thick / 2))
+    return Solid(parts, holes)
+
+
+def _shell(rng: np.random.Generator) -> Solid:
+    """A hollow box, cylinder or ellipsoid, open at one side, some with windows."""
+    half, wall = rng.uniform(0.6, 1.3, 3), _wall(rng)
+    kind = rng.integers(3)
+    body: _Primitive
+    hollow: _Primitive
+    if kind == 0:
+        body, hollow = Box(half=half), Box(half=half - wall)
+    elif kind == 1:
+        body, hollow = Cylinder(radius=half[0], half=half[2]), Cylinder(radius=half[0] - wall, half=half[2] - wall)
+    else:
+        body, hollow = Ellipsoid(half=half), Ellipsoid(half=half - wall)
+    holes = [hollow, Box(np.array([0, 0, 2 + rng.uniform(0.1, 0.7) * half[2]]), _axes(rng, 2), np.full(3, 2.0))]
+    for _ in range(rng.integers(0, 4)):
+        direction = rng.standard_normal(3) * [1, 1, 0.5]
+        holes.append(Cylinder(direction, _along(direction), rng.uniform(0.1, 0.4), 1.5))
+    return Solid([body], holes)
+
+
+def _wheel(rng: np.random.Generator) -> Solid:
+    """A rim with a hub, spokes or a disc, some with teeth."""
+    radius, half, wall = rng.uniform(1.0, 1.6), rng.uniform(0.15, 0.5), _wall(rng)
+    hub = rng.uniform(0.2, 0.45)
+    parts: list[_Primitive] = []
+    holes: list[_Primitive] = []
+    # A ring is a disc less a bore, and the bore must not take the spokes: the ring is made of many short plates.
+    sides = 48
+    for k in range(sides):
+        angle = 2 * np.pi * (k + 0.03 * rng.random()) / sides
+        out = np.array([np.cos(angle), np.sin(angle), 0])
+        long = (radius + wall) * np.tan(np.pi / sides) * 1.02
+        parts.append(Box(radius * out, _along(out), np.array([long, half, wall / 2])[[*_order(out), 2]]))
+    parts.append(Cylinder(rng.normal(0, 0.01, 3), _axes(rng, 2), hub, half * rng.uniform(1.05, 1.6)))
+    holes.append(Cylinder(np.zeros(3), np.eye(3), hub - min(0.6 * hub, _wall(rng)), 3.0))
+    if rng.random() < 0.5:
+        parts.append(Cylinder(rng.normal(0, 0.02, 3), _axes(rng, 2), radius, _wall(rng) / 2))
+        for angle in np.linspace(0, 2 * np.pi, rng.integers(4, 8), endpoint=False):
+            place = 0.5 * (hub + radius) * np.array([np.cos(angle), np.sin(angle), 0])
+            holes.append(Cylinder(place, np.eye(3), rng.uniform(0.1, 0.4) * (radius - hub), 0.9 * half))
+    else:
+        for angle in np.linspace(0, 2 * np.pi, rng.integers(3, 8), endpoint=False):
+            out = np.array([np.cos(angle), np.sin(angle), 0])
+            size = np.array([rng.uniform(0.05, 0.2), rng.uniform(0.5, 0.9) * half, (radius - hub / 2) / 2])
+            parts.append(Box((radius + hub / 2) / 2 * out, _along(out), size[[*_order(out), 2]]))
+    return Solid(parts, holes)
+
+
+def _order(out: Floats) -> list[int]:
+    """Say which of a pose's first two axes is tangent to the wheel and which is its axle."""
+    axle = np.abs(_along(out)[2, :2]).argmax()
+    return [1, 0] if axle == 0 else [0, 1]
+
+
+def _rods(rng: np.random.Generator) -> Solid:
+    """A frame of thin rods between random nodes, with a plate."""
+    nodes = rng.uniform(-1.1, 1.1, (rng.integers(4, 8), 3))
+    parts: list[_Primitive] = []
+    for first, second in zip(nodes, np.roll(nodes, 1, axis=0), strict=True):
+        way = second - first
+        parts.append(Cylinder((first + second) / 2, _along(way), _wall(rng), float(np.linalg.norm(way)) / 2 + 0.05))
+    half = rng.uniform(0.5, 1.1, 3)
+    half[2] = _wall(rng) / 2
+    parts.append(Box(rng.uniform(-0.3, 0.3, 3), Rotation.random(random_state=rng).as_matrix(), half))
+    return Solid(parts)
+
+
+def _blob(rng: np.random.Generator) -> Solid:
+    """Ellipsoids grown together, some of them flat or thin: bodies with ears, fins and limbs."""
+    parts: list[_Primitive] = [Ellipsoid(half=rng.uniform(0.4, 0.9, 3))]
+    for _ in range(rng.integers(4, 9)):
+        half = rng.uniform(0.3, 0.8, 3)
+        half[2] = rng.choice([_wall(rng), half[2]])
+        if rng.random() < 0.4:
+            half[1] = half[2]
+        turn = Rotation.random(random_state=rng).as_matrix()
+        parts.append(Ellipsoid(rng.uniform(-0.8, 0.8, 3), turn, half))
+    return Solid(parts)
+
+
+FAMILIES: list[Callable[[np.random.Generator], Solid]] = [_bracket, _fins, _pipes, _shell, _wheel, _rods, _blob]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    write_solids(options.path, options.count, seed=options.seed)
