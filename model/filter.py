@@ -5,12 +5,9 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +18,9 @@ from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame, is_scene, patch_scales, zoom_of
-from straightpcf.model.on_device import OnDevice, cut_out
-from straightpcf.model.patches import Patches
-from straightpcf.model.spread import spread
+from straightpcf.model.on_device import OnDevice
+from straightpcf.model.on_host import OnHost
+from straightpcf.model.processor import Processor
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
@@ -40,8 +37,6 @@ TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 _PROBES = 48  # patches on which "auto" reads the noise
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -151,7 +146,11 @@ class Filter:
         self.even = even
         self.zoom = zoom
         self.turns = turns(_TURNS).to(device)
-        self.on_device = None if device == "cpu" else OnDevice(self.forward, self.distance, device)
+        self.processor: Processor
+        if device == "cpu":
+            self.processor = OnHost(self.forward, self.distance, self.threads)
+        else:
+            self.processor = OnDevice(self.forward, self.distance, device)
         keep_large_buffers()
 
     def forward(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
@@ -221,7 +220,6 @@ class Run:
         self.distances: list[float] = []
         self.scene = False
         self.zoom = 1.0  # of the pass that comes
-        self.cuts: list[Patches] = []  # of the last pass, where the filter has a device
         self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
 
     def patches(self) -> Iterator[FinishedPatch]:
@@ -231,24 +229,23 @@ class Run:
         planned = None if self.options.iterations == "auto" else self.options.iterations
         tiles = split(self.points.xyz, self.filter.tile_points)
         tiling: Tiling | None = None
-        with ThreadPoolExecutor(self.filter.threads, initializer=_one_thread) as pool:
-            while True:
-                here = self.frame.enter(self.points.xyz)
-                here += self.moved
-                evened = self._evened(here, tiling, planned)
-                here += evened
-                tiling = Tiling(
-                    here, tiles, coverage=self.filter.coverage, seed=self.options.seed, device=self.filter.device
-                )
-                self.noise[1] = self._noise(here, tiling, pool)
-                if self.iterations == 0:
-                    self.noise[0] = self.noise[1]
-                left = self._passes_left(planned)
-                if left == 0:
-                    return
-                self.iterations += 1
-                self.moved += evened
-                yield from self._pass(here, tiling, pool, left)
+        while True:
+            here = self.frame.enter(self.points.xyz)
+            here += self.moved
+            evened = self._evened(here, tiling, planned)
+            here += evened
+            tiling = Tiling(
+                here, tiles, coverage=self.filter.coverage, seed=self.options.seed, device=self.filter.device
+            )
+            self.noise[1] = self._noise(here, tiling)
+            if self.iterations == 0:
+                self.noise[0] = self.noise[1]
+            left = self._passes_left(planned)
+            if left == 0:
+                return
+            self.iterations += 1
+            self.moved += evened
+            yield from self._pass(here, tiling, left)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -278,26 +275,15 @@ class Run:
         """
         if tiling is None or not self.filter.even or self.iterations == planned or self.scene:
             return 0.0
-        limit = _EVENED * self.noise[0]
-        if self.filter.on_device is not None:
-            return self.filter.on_device.spread(here, self.cuts, limit)
-        evened = np.empty_like(here)
-        for rows, own in tiling.surroundings():
-            evened[rows[:own]] = spread(here[rows], limit, workers=self.filter.threads)[:own]
-        return evened
+        return self.filter.processor.spread(here, tiling, _EVENED * self.noise[0])
 
-    def _pass(
-        self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor, left: int
-    ) -> Iterator[FinishedPatch]:
+    def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
         settled = 0
         # The patches are cut from `here`, so results may be written into self.moved as they come.
-        self.cuts.clear()
         for cut in tiling.cuts():
-            if self.filter.on_device is not None:
-                self.cuts.append(cut)
             scales = patch_scales(cut.radii, scene=self.scene, zoom=self.zoom)
-            for patch, displacement in self._displacements(here, cut, scales, pool):
+            for patch, displacement in self.filter.processor.displacements(here, cut, scales, self.probed):
                 owned = cut.owned_points(patch)
                 self.moved[owned] += displacement / scales[patch]
                 settled += len(owned)
@@ -308,27 +294,7 @@ class Run:
                 progress = (done_before + settled / len(here)) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
 
-    def _displacements(
-        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
-    ) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
-        """Run the network over all patches; yield each one's displacements of the points it owns, in its own scale."""
-        if self.filter.on_device is not None:
-            yield from self.filter.on_device.displacements(here, cut, scales, self.probed)
-            return
-
-        points = torch.from_numpy(here)
-
-        def move(patch: int) -> npt.NDArray[np.float64]:
-            known = self.probed.get(patch)
-            distance = None if known is None else torch.tensor([[known]])
-            owned = int(cut.owned[patch])
-            x = cut_out(points, cut, scales, np.array([patch]))
-            return self.filter.forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned].double().numpy()
-
-        results = _bounded_map(pool, move, range(len(cut.seeds)), ahead=2 * self.filter.threads)
-        yield from enumerate(results)
-
-    def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling, pool: ThreadPoolExecutor) -> float:
+    def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling) -> float:
         """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame.
 
         Before the first pass over an object it is read a second time, in the size that the first reading asks for.
@@ -337,30 +303,16 @@ class Run:
         self.scene = is_scene(probes.radii)
         self.zoom = 1.0
         scales = patch_scales(probes.radii, scene=self.scene)
-        distances = self._read(here, probes, scales, pool)
+        distances = self.filter.processor.distances(here, probes, scales)
         self.distances.append(float(np.median(distances)))
         noise = float(np.median(self.filter.calibration.noise_std(distances) / scales))
         if self.iterations == 0 and self.filter.zoom and not self.scene:
             self.zoom = zoom_of(noise, probes.radii)
         if self.zoom != 1.0:
-            distances = self._read(here, probes, patch_scales(probes.radii, scene=False, zoom=self.zoom), pool)
+            zoomed = patch_scales(probes.radii, scene=False, zoom=self.zoom)
+            distances = self.filter.processor.distances(here, probes, zoomed)
         self.probed = dict(zip(numbers, distances.tolist(), strict=False))
         return noise
-
-    def _read(
-        self, here: npt.NDArray[np.float64], probes: Patches, scales: npt.NDArray[np.float64], pool: ThreadPoolExecutor
-    ) -> npt.NDArray[np.float64]:
-        """Return d of each of some patches, (M,)."""
-        if self.filter.on_device is not None:
-            return self.filter.on_device.distances(here, probes, scales)
-
-        points = torch.from_numpy(here)
-
-        def read(patch: int) -> float:
-            with torch.inference_mode():
-                return float(self.filter.distance(cut_out(points, probes, scales, np.array([patch]))))
-
-        return np.array(list(pool.map(read, range(len(probes.seeds)))))
 
 
 class _Distinct:
@@ -396,28 +348,3 @@ def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
         hashed ^= (xyz[:, axis] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
     hashed.sort()
     return bool((hashed[1:] == hashed[:-1]).any())
-
-
-def _one_thread() -> None:
-    # Patches run side by side, one per thread; inside a patch more threads would only wait for each other.
-    torch.set_num_threads(1)
-
-
-def _bounded_map(pool: ThreadPoolExecutor, function: Callable[[int], _T], items: range, ahead: int) -> Iterator[_T]:
-    """Map in order with at most `ahead` results waiting, so that a slow reader does not fill the memory."""
-    waiting: deque[Future[_T]] = deque()
-    try:
-        for item in items:
-            waiting.append(pool.submit(_inference, function, item))
-            if len(waiting) >= ahead:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
-
-
-def _inference(function: Callable[[int], _T], item: int) -> _T:
-    with torch.inference_mode():  # the mode belongs to a thread
-        return function(item)

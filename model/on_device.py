@@ -19,14 +19,13 @@ import torch
 
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
+from straightpcf.model.processor import Floats, Forward, cut_out
 from straightpcf.model.spread import AROUND, spread_among
+from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
 
-__all__ = ["Capture", "Forward", "Graphs", "OnDevice", "capture_cuda_graph", "cut_out"]
+__all__ = ["Capture", "Graphs", "OnDevice", "capture_cuda_graph"]
 
-Floats = npt.NDArray[np.float64]
-# x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
-Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch.Tensor]
 # A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
 Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
 
@@ -91,7 +90,7 @@ class Graphs:
 
 
 class OnDevice:
-    """What the filter asks of its device; from one thread at a time."""
+    """The Processor of a device; for one thread at a time."""
 
     def __init__(
         self,
@@ -109,10 +108,9 @@ class OnDevice:
     def displacements(
         self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
     ) -> Iterator[tuple[int, Floats]]:
-        """Yield patch after patch, by number, how far the points that it owns move, in its own scale.
+        """Do what a Processor does; while the device computes a batch, the results of the one before are read.
 
-        probed: what the DistanceModule said of patches before, by number. While the device computes a batch, the
-        results of the one before come over and are read. Raises TooLarge where it has no memory for one patch.
+        Raises TooLarge where it has no memory for one patch.
         """
         points = torch.from_numpy(here).to(self.device)
         waiting: deque[tuple[range, _Result]] = deque()
@@ -147,12 +145,12 @@ class OnDevice:
         return distances
 
     @torch.inference_mode()
-    def spread(self, here: Floats, cuts: list[Patches], limit: float) -> Floats:
-        """Do what `model.spread.spread` does, a point's neighbours taken from the patch that owned it."""
+    def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
+        """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before."""
         points = torch.from_numpy(here).to(self.device)
-        nearest = min(AROUND, cuts[0].index.shape[1] - 1)
+        nearest = min(AROUND, PATCH_SIZE - 1, len(here) - 1)
         around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
-        for cut in cuts:
+        for cut in tiling.cuts():
             for first in range(0, len(cut.seeds), self.batch):
                 batch = np.arange(first, min(first + self.batch, len(cut.seeds)))
                 x = cut_out(points, cut, np.ones(len(cut.seeds)), batch)
@@ -199,15 +197,6 @@ class _Result:
         if self._there is not None:
             self._there.synchronize()
         return self._host.numpy()
-
-
-def cut_out(points: torch.Tensor, cut: Patches, scales: Floats, batch: npt.NDArray[np.int64]) -> torch.Tensor:
-    """Cut some patches out of the points, centred on their seeds: (B, P, 3) float32, on the points' device."""
-    index, seeds, scale = (
-        torch.from_numpy(part[batch]).to(points.device) for part in (cut.index, cut.seeds, scales)
-    )  # fmt: skip
-    local = points[index.long()] - points[seeds][:, None]
-    return (local * scale[:, None, None]).float()
 
 
 def _read(batch: range, result: _Result, cut: Patches) -> Iterator[tuple[int, Floats]]:

@@ -44,6 +44,7 @@ class Tiling:
 
     One tile is the whole cloud, cut as `cut_patches` does. Of several, each is cut together with its halo, the
     points around it that its patches reach; a point's owner is always a patch of its own tile's cut.
+    For a device the cuts are kept: spreading reads them again.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Tiling:
         cut = cut_patches if device == "cpu" else partial(cut_patches_on, torch.device(device))
         self._cut: Callable[[npt.NDArray[np.float64]], Patches] = partial(cut, coverage=coverage, seed=seed)
         self._margins: list[float] = []
+        self._kept: list[Patches] | None = None if device == "cpu" else []
 
     @cached_property
     def whole(self) -> Patches | None:
@@ -86,9 +88,14 @@ class Tiling:
         if self.whole is not None:
             yield self.whole
             return
+        if self._kept:
+            yield from self._kept
+            return
         for rows, own in self.surroundings():
-            cut = self._cut(self._xyz[rows])
-            yield cut.owning_below(own).of_rows(rows)
+            cut = self._cut(self._xyz[rows]).owning_below(own).of_rows(rows)
+            if self._kept is not None:
+                self._kept.append(cut)
+            yield cut
 
     def surroundings(self) -> Iterator[tuple[npt.NDArray[np.int64], int]]:
         """Yield each tile's rows, those of its halo behind, and how many are its own. Call `probes` before."""

@@ -12,8 +12,8 @@ import torch
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import Capture, Graphs, OnDevice
-from straightpcf.model.patches import cut_patches
 from straightpcf.model.spread import spread
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import TooLarge
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import noisy, sphere, torus
@@ -37,7 +37,7 @@ def on_device(
     network: torch.nn.Module, *, batch: int = 4, capture: Capture = capture_by_calling, tile_points: int | None = None
 ) -> Filter:
     model = Filter(network, threads=1, coverage=3, tile_points=tile_points)  # type: ignore[arg-type]
-    model.on_device = OnDevice(model.forward, model.distance, "cpu", batch=batch, capture=capture)
+    model.processor = OnDevice(model.forward, model.distance, "cpu", batch=batch, capture=capture)
     return model
 
 
@@ -64,8 +64,8 @@ def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
 
 def test_neighbours_of_a_patch_spread_points_as_neighbours_of_the_cloud_do(network: StraightPCF) -> None:
     ball = sphere(8000, 0)
-    cut = cut_patches(ball, coverage=3, seed=0)
-    moved = on_device(network).on_device.spread(ball, [cut], 1.0)  # type: ignore[union-attr]
+    tiling = Tiling(ball, split(ball, 10_000), coverage=3, seed=0)
+    moved = on_device(network).processor.spread(ball, tiling, 1.0)
     apart = np.linalg.norm(moved - spread(ball, 1.0), axis=1)
     assert (apart < 1e-5).mean() > 0.99
     assert apart.mean() < 0.002 * np.linalg.norm(moved, axis=1).mean()
@@ -123,7 +123,7 @@ def test_out_of_memory_halves_the_batch_and_goes_on(network: StraightPCF) -> Non
     small = on_device(_SmallMemory(network, 3), batch=8)
     expected = Filter(network, threads=1, coverage=3).denoise(cloud, options).xyz
     np.testing.assert_allclose(small.denoise(cloud, options).xyz, expected, atol=1e-6)
-    assert small.on_device is not None
-    assert small.on_device.batch == 2
+    assert isinstance(small.processor, OnDevice)
+    assert small.processor.batch == 2
     with pytest.raises(TooLarge, match="patch of 1000"):
         on_device(_SmallMemory(network, 0), batch=8).denoise(cloud, options)

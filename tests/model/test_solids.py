@@ -29,7 +29,12 @@ def test_a_step_along_the_normal_leaves_the_solid_and_one_against_it_enters(fami
 def test_points_are_spread_by_area() -> None:
     rng = np.random.default_rng(0)
     xyz, normals = Solid([Box(half=np.array([1.0, 0.5, 0.25]))], [Cylinder(radius=0.2, half=1.0)]).sample(rng, 40_000)
-    areas = {"top": 2 * (2 * 1 - np.pi * 0.04), "long": 2 * 2 * 0.5, "short": 2 * 1 * 0.5, "bore": 2 * np.pi * 0.2 * 0.5}
+    areas = {
+        "top": 2 * (2 * 1 - np.pi * 0.04),
+        "long": 2 * 2 * 0.5,
+        "short": 2 * 1 * 0.5,
+        "bore": 2 * np.pi * 0.2 * 0.5,
+    }
     bore = np.hypot(xyz[:, 0], xyz[:, 1]) < 0.2 + 1e-9
     found = {
         "top": (np.abs(normals[:, 2]) > 0.5).mean(),

@@ -69,7 +69,7 @@ def test_the_filter_spreads_between_passes_only(monkeypatch: pytest.MonkeyPatch)
         calls.append(limit)
         return spread(xyz, limit, workers=workers)
 
-    monkeypatch.setattr("straightpcf.model.filter.spread", counted)
+    monkeypatch.setattr("straightpcf.model.on_host.spread", counted)
     model = Filter(StraightPCF(), threads=1)
     for passes, between in [(1, 0), (3, 2)]:
         calls.clear()

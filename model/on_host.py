@@ -1,0 +1,83 @@
+"""A pass of the filter on the CPU: patches side by side, one a thread."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from straightpcf.model.patches import Patches
+from straightpcf.model.processor import Floats, Forward, cut_out
+from straightpcf.model.spread import spread
+from straightpcf.model.tiles import Tiling
+
+__all__ = ["OnHost"]
+
+_T = TypeVar("_T")
+
+
+class OnHost:
+    """The Processor of the CPU, on threads of its own."""
+
+    def __init__(self, forward: Forward, distances: Callable[[torch.Tensor], torch.Tensor], threads: int) -> None:
+        self._forward, self._distances, self._threads = forward, distances, threads
+        self._pool = ThreadPoolExecutor(threads, initializer=_one_thread)
+
+    def displacements(
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
+    ) -> Iterator[tuple[int, Floats]]:
+        """Evaluate few patches ahead, so that a slow reader does not fill the memory."""
+        points = torch.from_numpy(here)
+
+        def move(patch: int) -> Floats:
+            known = probed.get(patch)
+            distance = None if known is None else torch.tensor([[known]])
+            owned = int(cut.owned[patch])
+            x = cut_out(points, cut, scales, np.array([patch]))
+            return self._forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned].double().numpy()
+
+        yield from enumerate(self._map(move, range(len(cut.seeds))))
+
+    def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
+        """Return what the DistanceModule says of each patch: (M,)."""
+        points = torch.from_numpy(here)
+
+        def read(patch: int) -> float:
+            return float(self._distances(cut_out(points, cut, scales, np.array([patch]))))
+
+        return np.array(list(self._map(read, range(len(cut.seeds)))))
+
+    def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
+        """Spread tile by tile, the halo around."""
+        moved = np.empty_like(here)
+        for rows, own in tiling.surroundings():
+            moved[rows[:own]] = spread(here[rows], limit, workers=self._threads)[:own]
+        return moved
+
+    def _map(self, function: Callable[[int], _T], items: range) -> Iterator[_T]:
+        """Map in order, few results waiting."""
+        waiting: deque[Future[_T]] = deque()
+        try:
+            for item in items:
+                waiting.append(self._pool.submit(_inference, function, item))
+                if len(waiting) >= 2 * self._threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _one_thread() -> None:
+    # Inside a patch more threads would only wait for each other.
+    torch.set_num_threads(1)
+
+
+def _inference(function: Callable[[int], _T], item: int) -> _T:
+    with torch.inference_mode():  # the mode belongs to a thread
+        return function(item)
