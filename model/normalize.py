@@ -9,15 +9,15 @@ import numpy.typing as npt
 
 __all__ = ["CloudFrame", "is_scene", "patch_scales", "zoom_of"]
 
-# Patch radii seen in training, in radii of the object's bounding sphere: the 1st and 99th percentile of
-# punet_train.npz at 10K to 50K points (docs/training.md says how they were measured).
-_SMALLEST_RADIUS, _LARGEST_RADIUS = 0.13, 0.58
+# Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
+# to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training.md says how they were measured).
+_SMALLEST_RADIUS, _LARGEST_RADIUS = 0.1, 0.58
 _USUAL_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
-_SHOWN_NOISE = 0.024
-_SMALLEST_ZOOM, _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 0.8, 2.5, 0.65
+_SHOWN_NOISE, _SMALLEST_ZOOM = 0.03, 1.0
+_LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
 _BLOCK = 2**16  # rows whose distances are held at once
 
 
@@ -54,14 +54,21 @@ def is_scene(radii: npt.NDArray[np.float64]) -> bool:
     return float(np.median(radii)) < _SCENE_RADIUS
 
 
-def zoom_of(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
+def zoom_of(
+    noise_std: float,
+    radii: npt.NDArray[np.float64],
+    *,
+    shown: float = _SHOWN_NOISE,
+    smallest: float = _SMALLEST_ZOOM,
+) -> float:
     """Return the factor by which the first pass shows an object larger, for noise and patch radii in the unit ball.
 
+    shown: the std that its noise is brought to, where limits allow it; smallest: the least factor.
     Noise and thin walls look alike, and a patch alone does not tell how much noise its cloud has. With the noise of
     every cloud brought to about one size, all else in a patch tells which it is (docs/training.md has the figures).
     """
     largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
-    return float(np.clip(_SHOWN_NOISE / max(noise_std, 1e-9), _SMALLEST_ZOOM, largest))
+    return float(np.clip(shown / max(noise_std, 1e-9), smallest, largest))
 
 
 def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1.0) -> npt.NDArray[np.float64]:

@@ -42,6 +42,8 @@ SCALES = (0.8, 1.2)  # augmentation
 # The share of patches shown as the first pass of the filter shows them: with noise of 0 to 3 % of the cloud's radius,
 # in the size that goes with it (`zoom_of`). The others are shown as later passes see them, with t in [0, 1).
 FIRST_PASSES = 0.5
+# Somewhat smaller than the filter shows them: training with more noise than this loses thin walls (docs/training.md).
+_SHOWN_NOISE, _SMALLEST_ZOOM = 0.024, 0.8
 # Their noise, in radii of the cloud's bounding sphere.
 FIRST_NOISE = 0.03 * (np.arange(60) + 0.5) / 60
 _RADII = 200  # patches of a cloud that are measured
@@ -142,7 +144,7 @@ class PatchSource:
         """Return the zoom of a first pass over a cloud (N, 3) for each of `FIRST_NOISE`."""
         some = cloud[:: max(1, len(cloud) // _RADII)]
         radii = tree.query(some, k=[min(PATCH_SIZE, len(cloud))])[0][:, 0]
-        return np.array([zoom_of(std, radii) for std in FIRST_NOISE])
+        return np.array([zoom_of(std, radii, shown=_SHOWN_NOISE, smallest=_SMALLEST_ZOOM) for std in FIRST_NOISE])
 
     @classmethod
     def read(cls, *paths: Path, validation: bool = False) -> PatchSource:
