@@ -1,6 +1,6 @@
 """Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, with exact normals.
 
-python -m straightpcf.model.train.solids solids.npz --count 24
+python -m straightpcf.model.train.solids solids.npz --count 28
 
 Thin walls are what a denoiser takes for noise, and PUNet's training split has few of them. A solid is a union of parts
 less a union of holes; its surface is sampled exactly, part by part, with no mesh in between.

@@ -35,6 +35,15 @@ def test_every_point_is_owned_once_by_patches_of_its_own_tiles_cut() -> None:
     assert [sorted(rows) for rows in owned] == [tile.tolist() for tile in tiles]
 
 
+def test_a_devices_cuts_are_made_once_and_read_again() -> None:
+    xyz = noisy(torus(12_000), 0.01)
+    tiling = Tiling(xyz, split(xyz, 6_000), coverage=3, seed=0, device="cpu:0")  # "cpu" is the host's own way
+    tiling.probes(48)
+    once, again = list(tiling.cuts()), list(tiling.cuts())
+    assert len(once) == 2
+    assert all(first is second for first, second in zip(once, again, strict=True))
+
+
 def test_a_halo_that_would_be_the_whole_cloud_is_held_to_the_size_of_its_tile() -> None:
     # Half of the points lie in one dense spot, so sparse patches reach everywhere.
     xyz = np.concatenate([0.001 * torus(20_000), torus(20_000)])
