@@ -20,7 +20,7 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "noise_table", "passes"
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
-    "starts": tuple(product((0.70, 0.73, 0.76, 0.79), (0.88, 0.895, 0.905, 0.92))),
+    "starts": tuple(product((0.45, 0.55, 0.62, 0.66, 0.70, 0.73, 0.76), (0.86, 0.88, 0.895, 0.905, 0.92))),
     "polish": ((), (0.3,), (0.45,), (0.6,), (0.45, 0.7), (0.45, 0.8), (0.45, 0.9), (0.6, 0.9)),
     "settled": (0.16, 0.18, 0.2, 0.22, 0.25),
     "stirred": (0.4, 0.5, 0.6),

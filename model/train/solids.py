@@ -1,9 +1,9 @@
-"""Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, with exact normals.
+"""Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, and smooth bodies.
 
 python -m straightpcf.model.train.solids solids.npz --count 28
 
 Thin walls are what a denoiser takes for noise, and PUNet's training split has few of them. A solid is a union of parts
-less a union of holes; its surface is sampled exactly, part by part, with no mesh in between.
+less a union of holes; its surface is sampled exactly, part by part, with no mesh in between. Normals are exact.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.bodies import Body, carving, creature
 
-__all__ = ["FAMILIES", "RESOLUTIONS", "Box", "Cylinder", "Ellipsoid", "Solid", "write_solids"]
+__all__ = ["FAMILIES", "RESOLUTIONS", "Box", "Cylinder", "Ellipsoid", "Ring", "Solid", "write_solids"]
 
 Floats = npt.NDArray[np.float64]
 Samples = tuple[Floats, Floats]  # points (N, 3) and their unit normals (N, 3)
@@ -35,7 +36,7 @@ _WALL = (0.05, 0.25)  # thickness, in a frame where solids have a radius of abou
 
 @dataclass(frozen=True)
 class _Primitive(ABC):
-    """A convex body in a pose of its own."""
+    """A simple body in a pose of its own."""
 
     centre: Floats = field(default_factory=lambda: np.zeros(3))
     turn: Floats = field(default_factory=lambda: np.eye(3))  # columns: the body's axes
@@ -99,6 +100,23 @@ class Cylinder(_Primitive):
 
     def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
         return (np.hypot(xyz[:, 0], xyz[:, 1]) < self.radius) & (np.abs(xyz[:, 2]) < self.half)
+
+
+@dataclass(frozen=True)
+class Ring(Cylinder):
+    """A cylinder less a bore of radius `inner` along its axis."""
+
+    inner: float = 0.5
+
+    def _surface(self, rng: np.random.Generator, density: float) -> Samples:
+        points, normals = super()._surface(rng, density)
+        kept = np.hypot(points[:, 0], points[:, 1]) >= self.inner
+        inside, inwards = Cylinder(radius=self.inner, half=self.half)._surface(rng, density)
+        wall = np.abs(inwards[:, 2]) < 0.5
+        return np.concatenate([points[kept], inside[wall]]), np.concatenate([normals[kept], -inwards[wall]])
+
+    def _contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        return super()._contains(xyz) & (np.hypot(xyz[:, 0], xyz[:, 1]) > self.inner)
 
 
 @dataclass(frozen=True)
@@ -263,37 +281,44 @@ def _shell(rng: np.random.Generator) -> Solid:
 
 
 def _wheel(rng: np.random.Generator) -> Solid:
-    """A rim with a hub, spokes or a disc, some with teeth."""
-    radius, half, wall = rng.uniform(1.0, 1.6), rng.uniform(0.15, 0.5), _wall(rng)
-    hub = rng.uniform(0.2, 0.45)
-    parts: list[_Primitive] = []
+    """A rim, some with flanges or teeth, around a hub; between them a disc with holes, or spokes."""
+    radius, half, wall = rng.uniform(0.9, 1.6), rng.uniform(0.1, 0.5), _wall(rng)
+    hub, bore = rng.uniform(0.2, 0.45), rng.uniform(0.1, 0.15)
+    inside = radius - wall
+    parts: list[_Primitive] = [
+        Ring(_off(rng), _axes(rng, 2), radius, half, inside),
+        Ring(_off(rng), _axes(rng, 2), hub, half * rng.uniform(1.05, 1.6), bore),
+    ]
     holes: list[_Primitive] = []
-    # A ring is a disc less a bore, and the bore must not take the spokes: the ring is made of many short plates.
-    sides = 48
-    for k in range(sides):
-        angle = 2 * np.pi * (k + 0.03 * rng.random()) / sides
-        out = np.array([np.cos(angle), np.sin(angle), 0])
-        long = (radius + wall) * np.tan(np.pi / sides) * 1.02
-        parts.append(Box(radius * out, _along(out), np.array([long, half, wall / 2])[[*_order(out), 2]]))
-    parts.append(Cylinder(rng.normal(0, 0.01, 3), _axes(rng, 2), hub, half * rng.uniform(1.05, 1.6)))
-    holes.append(Cylinder(np.zeros(3), np.eye(3), hub - min(0.6 * hub, _wall(rng)), 3.0))
     if rng.random() < 0.5:
-        parts.append(Cylinder(rng.normal(0, 0.02, 3), _axes(rng, 2), radius, _wall(rng) / 2))
-        for angle in np.linspace(0, 2 * np.pi, rng.integers(4, 8), endpoint=False):
-            place = 0.5 * (hub + radius) * np.array([np.cos(angle), np.sin(angle), 0])
-            holes.append(Cylinder(place, np.eye(3), rng.uniform(0.1, 0.4) * (radius - hub), 0.9 * half))
+        thick, reach = min(_wall(rng), 0.6 * half), rng.uniform(0.08, 0.3)
+        for side in (-1, 1):
+            end = np.array([0, 0, side * (half - 0.6 * thick)])
+            parts.append(Ring(end + _off(rng), _axes(rng, 2), radius + reach, thick / 2, inside + 0.3 * wall))
+    elif rng.random() < 0.5:
+        teeth = int(rng.integers(12, 36))
+        size = np.array([rng.uniform(0.05, 0.15) + wall / 2, 0.5 * np.pi * radius / teeth, 0.97 * half])
+        parts += [Box(radius * turn[:, 0], turn, size) for turn in _around(rng, teeth)]
+    middle, long = (hub + inside) / 2, (inside - hub) / 2
+    if rng.random() < 0.5:
+        parts.append(Ring(_off(rng), _axes(rng, 2), inside + wall / 2, _wall(rng) / 2, (hub + bore) / 2))
+        hole = rng.uniform(0.3, 0.9) * long
+        turns = _around(rng, int(rng.integers(0, 8)))
+        holes = [Cylinder(middle * turn[:, 0], np.eye(3), hole, 0.9 * half) for turn in turns]
     else:
-        for angle in np.linspace(0, 2 * np.pi, rng.integers(3, 8), endpoint=False):
-            out = np.array([np.cos(angle), np.sin(angle), 0])
-            size = np.array([rng.uniform(0.05, 0.2), rng.uniform(0.5, 0.9) * half, (radius - hub / 2) / 2])
-            parts.append(Box((radius + hub / 2) / 2 * out, _along(out), size[[*_order(out), 2]]))
+        size = np.array([long + 0.4 * wall, _wall(rng) / 2, rng.uniform(0.3, 0.9) * half])
+        parts += [Box(middle * turn[:, 0], turn, size) for turn in _around(rng, int(rng.integers(3, 9)))]
     return Solid(parts, holes)
 
 
-def _order(out: Floats) -> list[int]:
-    """Say which of a pose's first two axes is tangent to the wheel and which is its axle."""
-    axle = np.abs(_along(out)[2, :2]).argmax()
-    return [1, 0] if axle == 0 else [0, 1]
+def _off(rng: np.random.Generator) -> Floats:
+    return rng.normal(0, 0.004, 3)
+
+
+def _around(rng: np.random.Generator, count: int) -> list[Floats]:
+    """Return `count` poses about the z axis, evenly turned, whose x axis points outwards."""
+    angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(1, count)
+    return [np.asarray(Rotation.from_rotvec([0, 0, angle]).as_matrix()) for angle in angles]
 
 
 def _rods(rng: np.random.Generator) -> Solid:
@@ -322,7 +347,17 @@ def _blob(rng: np.random.Generator) -> Solid:
     return Solid(parts)
 
 
-FAMILIES: list[Callable[[np.random.Generator], Solid]] = [_bracket, _fins, _pipes, _shell, _wheel, _rods, _blob]
+FAMILIES: list[Callable[[np.random.Generator], Solid | Body]] = [
+    _bracket,
+    _fins,
+    _pipes,
+    _shell,
+    _wheel,
+    _rods,
+    _blob,
+    creature,
+    carving,
+]
 
 
 if __name__ == "__main__":

@@ -1,0 +1,182 @@
+"""Training clouds made in code: smooth bodies with limbs, ears and relief, sampled on a level set.
+
+Solids of plates and tubes (`model.train.solids`) teach thin walls and edges; what animals and statues have beside them
+is curvature everywhere. A body is where a smooth union of tapering limbs, less a relief of waves, is below zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Body", "Limb", "carving", "creature"]
+
+Floats = npt.NDArray[np.float64]
+
+# Points are drawn this near to the surface and brought onto it: evenly but for the Gaussian curvature times its square.
+_SHELL = 0.015
+_CELL = 0.08  # of the grid that tells where to draw, before it is halved
+_HALVINGS = 2
+_STEPS = 6  # of Newton's method
+_DRAWN = 400_000  # points at once
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A capsule from `start` to `end` (3,) whose radius goes from radii[0] to radii[1], flattened along `across`.
+
+    across: (3,) a unit vector, best at right angles to the axis; flat: how many times thinner the limb is along it.
+    """
+
+    start: Floats
+    end: Floats
+    radii: tuple[float, float]
+    across: Floats
+    flat: float = 1.0
+
+    def distance(self, xyz: Floats) -> tuple[Floats, Floats]:
+        """Return how far points (N, 3) are in the frame that makes the limb round, (N,), and the gradient (N, 3)."""
+        stretch = np.eye(3) + (self.flat - 1) * np.outer(self.across, self.across)
+        axis = (self.end - self.start) @ stretch
+        from_start = (xyz - self.start) @ stretch
+        along = from_start @ axis / (axis @ axis)
+        share = along.clip(0, 1)
+        off = from_start - share[:, None] * axis
+        length = np.linalg.norm(off, axis=1)
+        taper = self.radii[1] - self.radii[0]
+        gradient = off / np.maximum(length, 1e-12)[:, None]
+        gradient -= np.where((along > 0) & (along < 1), taper, 0.0)[:, None] * axis / (axis @ axis)
+        return length - self.radii[0] - share * taper, gradient @ stretch
+
+
+@dataclass(frozen=True)
+class Body:
+    """Limbs grown together, with a relief.
+
+    blend: how far around a joint it is rounded; waves: (J, 3) wave vectors, phases: (J,), heights: (J,) of the relief.
+    """
+
+    limbs: Sequence[Limb]
+    blend: float
+    waves: Floats
+    phases: Floats
+    heights: Floats
+
+    def value(self, xyz: Floats) -> tuple[Floats, Floats]:
+        """Return the function that is below zero inside, at points (N, 3): (N,), and its gradient (N, 3)."""
+        distances, gradients = zip(*(limb.distance(xyz) for limb in self.limbs), strict=True)
+        every = np.stack(distances)
+        nearest = every.min(axis=0)
+        weights = np.exp((nearest - every) / self.blend)
+        total = weights.sum(axis=0)
+        value = nearest - self.blend * np.log(total)
+        gradient = np.einsum("ln,lnd->nd", weights / total, np.stack(gradients))
+        angles = xyz @ self.waves.T + self.phases
+        return value - np.sin(angles) @ self.heights, gradient - np.cos(angles) * self.heights @ self.waves
+
+    def contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
+        """Say which points (N, 3) are inside: (N,)."""
+        return np.asarray(self.value(xyz)[0] < 0)
+
+    def sample(self, rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:
+        """Sample `count` points of the surface evenly, and their unit normals."""
+        cells, size = self._cells()
+        found: list[Floats] = []
+        while sum(map(len, found)) < count:
+            drawn = cells[rng.integers(len(cells), size=_DRAWN)] + rng.uniform(-size / 2, size / 2, (_DRAWN, 3))
+            value, gradient = self.value(drawn)
+            found.append(self._onto(drawn[np.abs(value) < _SHELL * np.linalg.norm(gradient, axis=1)]))
+        xyz = np.concatenate(found)[:count]
+        gradient = self.value(xyz)[1]
+        return xyz, gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+
+    def _cells(self) -> tuple[Floats, float]:
+        """Return the centres (M, 3) of grid cells that the surface, as thick as it is drawn, may cross; their side."""
+        ends = np.stack([end for limb in self.limbs for end in (limb.start, limb.end)])
+        widest = max(max(limb.radii) for limb in self.limbs) + self.blend * np.log(len(self.limbs))
+        margin = widest + np.abs(self.heights).sum() + 2 * _CELL
+        low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
+        grid = np.meshgrid(*(np.arange(low[axis], high[axis], _CELL) for axis in range(3)), indexing="ij")
+        cells, size = self._crossed(np.stack(grid, axis=-1).reshape(-1, 3), _CELL), _CELL
+        for _ in range(_HALVINGS):
+            size /= 2
+            corners = size / 2 * np.stack(np.meshgrid(*3 * [[-1, 1]]), axis=-1).reshape(-1, 3)
+            cells = self._crossed((cells[:, None] + corners).reshape(-1, 3), size)
+        return cells, size
+
+    def _crossed(self, centres: Floats, size: float) -> Floats:
+        # The steepest that the function is anywhere: no cell is missed.
+        slope = max(limb.flat + abs(limb.radii[1] - limb.radii[0]) for limb in self.limbs)
+        slope += float(np.abs(self.heights) @ np.linalg.norm(self.waves, axis=1))
+        parts = np.array_split(centres, 1 + len(centres) // _DRAWN)
+        value = np.concatenate([self.value(part)[0] for part in parts])
+        crossed: Floats = centres[np.abs(value) < slope * (np.sqrt(3) / 2 * size + _SHELL)]
+        return crossed
+
+    def _onto(self, xyz: Floats) -> Floats:
+        """Bring points (N, 3) onto the surface; those that Newton's method takes elsewhere are left out."""
+        start = xyz
+        for _ in range(_STEPS):
+            value, gradient = self.value(xyz)
+            xyz = xyz - (value / np.square(gradient).sum(axis=1))[:, None] * gradient
+        there = np.abs(self.value(xyz)[0]) < 1e-9
+        return np.asarray(xyz[there & (np.linalg.norm(xyz - start, axis=1) < 3 * _SHELL)])
+
+
+def _direction(rng: np.random.Generator, across: Floats | None = None) -> Floats:
+    """Return a unit vector, at right angles to `across` where that is given."""
+    way = rng.standard_normal(3)
+    if across is not None:
+        way -= way @ across / (across @ across) * across
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _limb(rng: np.random.Generator, start: Floats, end: Floats, radii: tuple[float, float], flat: float = 1.0) -> Limb:
+    return Limb(start, end, radii, _direction(rng, end - start), flat)
+
+
+def _relief(rng: np.random.Generator, lengths: tuple[float, float], slope: float) -> tuple[Floats, Floats, Floats]:
+    """Return waves of such lengths whose slopes add up to `slope` on average: wave vectors, phases, heights."""
+    count = int(rng.integers(3, 9))
+    wave = 2 * np.pi / np.exp(rng.uniform(np.log(lengths[0]), np.log(lengths[1]), count))
+    vectors = wave[:, None] * np.stack([_direction(rng) for _ in range(count)])
+    return vectors, rng.uniform(0, 2 * np.pi, count), slope / np.sqrt(count) / wave
+
+
+def creature(rng: np.random.Generator) -> Body:
+    """A trunk with two to four pairs of jointed limbs, a head with flat ears and a tail; hardly any relief."""
+    spine = np.array([0.0, 0, rng.uniform(0.3, 0.8)])
+    limbs = [_limb(rng, -spine, spine, (rng.uniform(0.3, 0.55), rng.uniform(0.25, 0.5)), rng.uniform(1, 1.5))]
+    for _ in range(rng.integers(2, 5)):
+        root = rng.uniform(-1, 1) * spine
+        thick = rng.uniform(0.07, 0.22)
+        knee = root + rng.uniform(0.5, 1.0) * _direction(rng)
+        foot = knee + rng.uniform(0.3, 0.8) * _direction(rng)
+        narrow = rng.uniform(0.5, 1.0)
+        for mirror in (np.ones(3), np.array([-1.0, 1, 1])):
+            limbs.append(_limb(rng, root * mirror, knee * mirror, (1.2 * thick, thick)))
+            limbs.append(_limb(rng, knee * mirror, foot * mirror, (thick, narrow * thick)))
+    head = 1.2 * spine + 0.5 * _direction(rng) * [0.2, 1, 1]
+    snout = head + rng.uniform(0.1, 0.5) * _direction(rng) * [0.2, 1, 1]
+    limbs.append(_limb(rng, 0.9 * spine, head, (0.2, 0.25)))
+    limbs.append(_limb(rng, head, snout, (rng.uniform(0.2, 0.35), rng.uniform(0.1, 0.25))))
+    ear, size = rng.uniform(0.25, 0.6) * _direction(rng), rng.uniform(0.15, 0.3)
+    flat = rng.uniform(2, 4)
+    for mirror in (np.ones(3), np.array([-1.0, 1, 1])):
+        limbs.append(_limb(rng, head, head + ear * mirror, (size, 0.6 * size), flat))
+    limbs.append(_limb(rng, -spine, -spine + rng.uniform(0.4, 1.2) * _direction(rng), (0.12, rng.uniform(0.04, 0.1))))
+    return Body(limbs, rng.uniform(0.02, 0.06), *_relief(rng, (0.2, 0.8), rng.uniform(0, 0.25)))
+
+
+def carving(rng: np.random.Generator) -> Body:
+    """A few large masses with a relief all over: folds, hair, bark."""
+    centres = rng.uniform(-0.6, 0.6, (rng.integers(3, 7), 3))
+    limbs = []
+    for centre in centres:
+        end = centre + rng.uniform(0.2, 1.0) * _direction(rng)
+        radii = rng.uniform(0.25, 0.6, 2)
+        limbs.append(_limb(rng, centre, end, (radii[0], radii[1]), rng.uniform(1, 2.5)))
+    return Body(limbs, rng.uniform(0.02, 0.12), *_relief(rng, (0.15, 0.7), rng.uniform(0.25, 0.7)))
