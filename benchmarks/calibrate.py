@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.quality import SHARED
+from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.checkpoint import save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.normalize import CloudFrame
@@ -40,6 +41,7 @@ def main() -> None:
     )
     parser.add_argument("--traces", type=Path, help="keep what was measured here, and use what is there")
     parser.add_argument("--noise", type=float, nargs="+", default=NOISE_LEVELS)
+    parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
     arguments = parser.parse_args()
@@ -52,20 +54,20 @@ def main() -> None:
     clouds = _clouds(arguments.data, arguments.clouds)
     model = Filter(network, threads=arguments.threads)
     model.calibration = noise_table(model, {name: clouds[name] for name in list(clouds)[::_TABLE_EVERY]})
-    traces = _traces(model, clouds, arguments.noise, arguments.traces)
+    traces = _traces(model, clouds, arguments.noise_type, arguments.noise, arguments.traces)
     calibration = calibrate(traces, model.calibration)
     columns = f"{'d before each pass':32} {'CD x1e4 after 0, 1, ...':42}"
-    print(f"{'cloud':18} {'noise':>7}  {columns} auto best")
+    print(f"{'cloud':18} {'noise':>16}  {columns} auto best")
     for t in traces:
         chosen, best = passes(calibration, t), int(np.argmin(t.chamfer))
         distances = " ".join(f"{d:.3f}" for d in t.distances)
         chamfer = " ".join(f"{1e4 * c:7.3f}" for c in t.chamfer)
-        print(f"{t.cloud:18} {t.noise_std:7.4f}  {distances:32} {chamfer:42} {chosen:4} {best:4}")
-    print(f"\n{'noise':>7} {'d':>7} {'auto / best CD':>15}")
-    for std in sorted({t.noise_std for t in traces}):
-        those = [t for t in traces if t.noise_std == std]
+        print(f"{t.cloud:18} {t.noise_type:8.8} {t.noise_std:7.4f}  {distances:32} {chamfer:42} {chosen:4} {best:4}")
+    print(f"\n{'noise':>16} {'d':>7} {'auto / best CD':>15}")
+    for kind, std in sorted({(t.noise_type, t.noise_std) for t in traces}):
+        those = [t for t in traces if (t.noise_type, t.noise_std) == (kind, std)]
         ratio = np.mean([t.chamfer[passes(calibration, t)] / max(min(t.chamfer[1:]), 1e-12) for t in those])
-        print(f"{std:7.4f} {np.median([t.distances[0] for t in those]):7.3f} {ratio:15.3f}")
+        print(f"{kind:8.8} {std:7.4f} {np.median([t.distances[0] for t in those]):7.3f} {ratio:15.3f}")
     print(json.dumps(calibration.to_metadata()))
     if arguments.out is not None:
         save_checkpoint(network, arguments.out, {"training": progress, **calibration.to_metadata()})
@@ -85,15 +87,16 @@ def _clouds(path: Path, wanted: list[str] | None) -> dict[str, npt.NDArray[np.fl
 
 
 def _traces(
-    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], noise: list[float], kept: Path | None
+    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], kind: str, noise: list[float], kept: Path | None
 ) -> list[Trace]:
     lines = kept.read_text().splitlines() if kept is not None and kept.is_file() else []
-    known = {(t.cloud, t.noise_std): t for t in (Trace(**json.loads(line)) for line in lines)}
+    known = {(t.cloud, t.noise_type, t.noise_std): t for t in (Trace(**json.loads(line)) for line in lines)}
     for name, clean in clouds.items():
         for std in noise:
-            if (name, std) in known:
+            if (name, kind, std) in known:
                 continue
-            known[name, std] = measured = trace(filter_, name, clean, std)
+            measured = trace(filter_, name, clean, make_noise(kind, clean, std, seed=0), std, kind)
+            known[name, kind, std] = measured
             if kept is not None:
                 with kept.open("a") as file:
                     file.write(json.dumps(asdict(measured)) + "\n")

@@ -177,7 +177,7 @@ def _draw(name: str, before: PointCloud, after: PointCloud, folder: Path) -> Non
                 axes["side 1"].set(xlim=axes["side 0"].get_xlim(), ylim=axes["side 0"].get_ylim())
     spacing = float(np.median(cKDTree(old).query(old[:MEASURED_POINTS], k=2)[0][:, 1]))
     bins = np.geomspace(max(moved.max(), 1e-12) * 1e-4, max(moved.max(), 1e-12), 80)
-    axes["moved"].hist(moved, bins=bins)
+    axes["moved"].hist(moved, bins=bins.tolist())
     axes["moved"].axvline(spacing, color="k", linestyle=":")
     axes["moved"].set(
         xscale="log", xlabel="moved by (the cloud's unit); dotted: to the nearest neighbour", ylabel="points"

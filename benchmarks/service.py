@@ -115,7 +115,7 @@ def livez(points: int) -> None:
         job = sdk.jobs.create(buffer.getvalue(), iterations=3)
         while job.refresh().state != "processing":
             time.sleep(0.05)
-        seconds = []
+        seconds: list[float] = []
         while len(seconds) < 2000 and not (len(seconds) % 100 == 0 and job.refresh().finished):
             began = time.perf_counter()
             client.get("/livez").raise_for_status()

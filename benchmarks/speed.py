@@ -70,20 +70,22 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _ours(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:
+    import torch
+
     from straightpcf.model.filter import load_filter
+    from straightpcf.model.on_host import OnHost
     from straightpcf.points.options import DenoiseOptions
 
     model = load_filter(options.weights, device="cpu", threads=options.threads)
     wanted = DenoiseOptions(iterations=options.iterations)
     model.denoise(noisy[:2000], wanted)  # what is compiled or loaded once is not the cloud's
     done: list[tuple[int, int]] = []  # each patch's points, and how many of them were wanted
-    move = model.move
 
-    def counted(x: Any, owned: Any, distance: Any = None) -> Any:
-        done.extend((x.shape[1], int(rows)) for rows in owned)
-        return move(x, owned, distance)
+    def counted(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        done.extend((x.shape[1], int(some)) for some in owned)
+        return model.forward(x, owned, distance, rows)
 
-    model.move = counted  # type: ignore[method-assign]
+    model.processor = OnHost(counted, model.distance, model.threads)
     began = time.perf_counter()
     result = model.denoise(noisy, wanted)
     seconds = time.perf_counter() - began

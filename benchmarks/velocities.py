@@ -54,7 +54,8 @@ def _normals(clean: torch.Tensor) -> torch.Tensor:
     index = torch.cdist(clean, clean).topk(_NEIGHBOURS, largest=False).indices
     around = torch.stack([patch[rows] for patch, rows in zip(clean, index, strict=True)])
     around = around - around.mean(dim=2, keepdim=True)
-    return torch.linalg.eigh((around.mT @ around).double()).eigenvectors[..., 0].float()
+    normals: torch.Tensor = torch.linalg.eigh((around.mT @ around).double()).eigenvectors[..., 0].float()
+    return normals
 
 
 def main() -> None:
@@ -68,10 +69,11 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     source = PatchSource.read(arguments.data / "punet_train.npz", validation=True)
     batch = source.draw(np.random.default_rng(1), arguments.patches)
-    parts = list(zip(*(t.split(_AT_ONCE) for t in (batch.noisy, batch.clean, batch.time)), strict=True))
+    parts = list(zip(*(torch.split(t, _AT_ONCE) for t in (batch.noisy, batch.clean, batch.time)), strict=True))
     quarter = (4 * batch.time.flatten()).long()
     print(f"{'velocities':44} {'across, of each module (in quarters of t)':58} along   end, across")
     for name in arguments.states:
+        modules: list[nn.Module]
         if name == "official":
             modules = [load_official_checkpoint(arguments.data / "official" / "ckpt_vm.pt")]
         else:

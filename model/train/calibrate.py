@@ -20,34 +20,53 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "noise_table", "passes"
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
-    "starts": tuple(product((0.45, 0.55, 0.62, 0.66, 0.70, 0.73, 0.76), (0.86, 0.88, 0.895, 0.905, 0.92))),
-    "polish": ((), (0.3,), (0.45,), (0.6,), (0.45, 0.7), (0.45, 0.8), (0.45, 0.9), (0.6, 0.9)),
+    "starts": tuple(product((0.55, 0.59, 0.62, 0.66, 0.70, 0.73), (0.86, 0.88, 0.895, 0.905, 0.92))),
+    "polish": (
+        (),
+        (0.22,),
+        (0.26,),
+        (0.3,),
+        (0.35,),
+        (0.4,),
+        (0.45,),
+        *product((0.22, 0.26, 0.3, 0.35, 0.4, 0.45), (0.65, 0.7, 0.75, 0.8, 0.85, 0.9)),
+    ),
     "settled": (0.16, 0.18, 0.2, 0.22, 0.25),
-    "stirred": (0.4, 0.5, 0.6),
+    "stirred": (0.4, 0.5),
     "most": (4, 5),
 }
-NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
+NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on."""
+    """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on.
+
+    noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it.
+    """
 
     cloud: str
     noise_std: float
     distances: tuple[float, ...]
     chamfer: tuple[float, ...]
+    noise_type: str = "gaussian"
 
 
-def trace(filter_: Filter, name: str, clean: npt.NDArray[np.float64], noise_std: float, *, seed: int = 0) -> Trace:
-    """Add Gaussian noise of `noise_std` radii to a clean unit-sphere cloud (N, 3) and filter it pass by pass."""
-    noisy = clean + noise_std * np.random.default_rng(seed).standard_normal(clean.shape)
+def trace(
+    filter_: Filter,
+    name: str,
+    clean: npt.NDArray[np.float64],
+    noisy: npt.NDArray[np.float64],
+    noise_std: float,
+    noise_type: str = "gaussian",
+) -> Trace:
+    """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
     run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"])))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
     chamfer = tuple(chamfer_distance(x, clean) for x in states.values())
-    return Trace(name, noise_std, tuple(run.distances), chamfer)
+    return Trace(name, noise_std, tuple(run.distances), chamfer, noise_type)
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
@@ -66,7 +85,7 @@ def calibrate(traces: Sequence[Trace], table: Calibration | None = None) -> Cali
 
     table: whose table of noise levels to keep; without one it is read off the traces.
     """
-    known = table or _with_table([(t.noise_std, t.distances[0]) for t in traces])
+    known = table or _with_table([(t.noise_std, t.distances[0]) for t in traces if t.noise_type == "gaussian"])
     choices = [replace(known, **dict(zip(_LIMITS, limits, strict=True))) for limits in product(*_LIMITS.values())]
     return min(choices, key=lambda choice: loss(choice, traces))
 
@@ -81,17 +100,17 @@ def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
 def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:
     """Rate `auto` on recorded traces: the mean log ratio of its CD to that of each cloud's best number of passes.
 
-    Every noise level weighs the same. A cloud that is worse than its input weighs its log ratio to it ten times more.
-    Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5.
+    Every level of every type of noise weighs the same. A cloud that is worse than its input weighs its log ratio to it
+    ten times more. Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5.
     """
-    by_level: dict[float, list[float]] = {}
+    by_level: dict[tuple[str, float], list[float]] = {}
     for t in traces:
         reached = t.chamfer[passes(calibration, t)]
         if t.chamfer[0] > 0:
             rating = math.log(reached / min(t.chamfer[1:])) + 10 * max(0.0, math.log(reached / t.chamfer[0]))
         else:
             rating = reached / 1e-5
-        by_level.setdefault(t.noise_std, []).append(rating)
+        by_level.setdefault((t.noise_type, t.noise_std), []).append(rating)
     return float(np.mean([np.mean(ratings) for ratings in by_level.values()]))
 
 

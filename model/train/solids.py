@@ -1,6 +1,6 @@
 """Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, and smooth bodies.
 
-python -m straightpcf.model.train.solids solids.npz --count 28
+python -m straightpcf.model.train.solids solids.npz --count 36
 
 Thin walls are what a denoiser takes for noise, and PUNet's training split has few of them. A solid is a union of parts
 less a union of holes; its surface is sampled exactly, part by part, with no mesh in between. Normals are exact.
@@ -363,7 +363,7 @@ FAMILIES: list[Callable[[np.random.Generator], Solid | Body]] = [
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path)
-    parser.add_argument("--count", type=int, default=24)
+    parser.add_argument("--count", type=int, default=36)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     write_solids(options.path, options.count, seed=options.seed)

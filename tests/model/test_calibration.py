@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from straightpcf.model.calibration import Calibration
+from straightpcf.model.filter import load_filter
+from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.train.calibrate import Trace, calibrate, loss, passes
+from straightpcf.model.train.calibrate import trace as measured
 from straightpcf.points.errors import MalformedFile
+from tests.clouds import noisy, sphere
 
 
 def trace(noise_std: float, *distances: float) -> Trace:
@@ -63,3 +67,21 @@ def test_a_calibration_survives_its_metadata_and_a_broken_one_is_refused() -> No
     for broken in ({"polished": 0.2}, {"distances": [0.5, 0.4], "noise": [0.0, 0.1]}, {"limits": [0.1]}, 7):
         with pytest.raises(MalformedFile):
             Calibration.from_metadata({"calibration": broken})
+
+
+def test_a_trace_has_d_and_cd_before_each_pass_and_after_the_last() -> None:
+    clean = sphere(400)
+    rough = noisy(clean, 0.03)
+    recorded = measured(load_filter(device="cpu", threads=1), "ball", clean, rough, 0.03, "laplace")
+    assert (recorded.cloud, recorded.noise_std, recorded.noise_type) == ("ball", 0.03, "laplace")
+    assert len(recorded.distances) == len(recorded.chamfer) == 6
+    assert recorded.chamfer[0] == pytest.approx(chamfer_distance(rough, clean))
+    assert min(recorded.chamfer) < recorded.chamfer[0]
+
+
+def test_levels_of_one_size_but_of_two_types_of_noise_weigh_apart() -> None:
+    good, bad = (0.3, 0.1, 0.1), (2.0, 1.0, 1.0)
+    often = [Trace(f"cloud{n}", 0.01, good, bad) for n in range(9)]
+    once = Trace("cloud", 0.01, good, (2.0, 1.5, 1.0), "uniform")
+    assert passes(Calibration(), once) == 1
+    assert loss(Calibration(), [*often, once]) == pytest.approx(np.log(1.5) / 2)

@@ -1,0 +1,47 @@
+"""The benchmarks' commands run: their figures are asserted where they are taken, here only that they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+
+def printed(name: str, *arguments: object) -> str:
+    ended = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def test_quality(tmp_path: Path) -> None:
+    options = ("--split", "validation", "--shapes", "sphere", "--resolution", 1000, "--noise", 0.02, "--iterations", 1)
+    printed("quality", *options, "--threads", 1, "--json", tmp_path / "rows.json")
+    (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert 0 < row["cd"] < row["noisy_cd"]
+
+
+def test_speed() -> None:
+    said = printed("speed", "--shape", "sphere", "--resolution", 1500, "--patches", 1, "--threads", 1)
+    ours, theirs = (
+        next(line for line in said.splitlines() if line.startswith(name)).split()
+        for name in ("this project", "authors' scheme")
+    )
+    assert 0 < float(ours[2]) < float(theirs[2])
+    assert float(said.split("ratio")[1]) > 1
+
+
+def test_scaling() -> None:
+    rows = [line.split() for line in printed("scaling", "--points", 500, 1000, "--threads", 1).splitlines()[2:]]
+    assert [row[0] for row in rows] == ["500", "1000"]
