@@ -20,22 +20,13 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "noise_table", "passes"
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
-    "starts": tuple(product((0.55, 0.59, 0.62, 0.66, 0.70, 0.73), (0.86, 0.88, 0.895, 0.905, 0.92))),
-    "polish": (
-        (),
-        (0.22,),
-        (0.26,),
-        (0.3,),
-        (0.35,),
-        (0.4,),
-        (0.45,),
-        *product((0.22, 0.26, 0.3, 0.35, 0.4, 0.45), (0.65, 0.7, 0.75, 0.8, 0.85, 0.9)),
-    ),
-    "settled": (0.16, 0.18, 0.2, 0.22, 0.25),
+    "starts": tuple(product((0.55, 0.59, 0.62, 0.66, 0.73), (0.86, 0.88, 0.895, 0.905, 0.92), (0.945, 0.955, 0.965))),
+    "polish": tuple(product((0.22, 0.26, 0.3, 0.35, 0.4, 0.45), (0.65, 0.7, 0.75, 0.8, 0.85, 0.9))),
+    "settled": (0.18, 0.2, 0.22, 0.25),
     "stirred": (0.4, 0.5),
-    "most": (4, 5),
+    "most": (5,),
 }
-NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03)
+NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.04, 0.05)
 
 
 @dataclass(frozen=True)
@@ -81,13 +72,13 @@ def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], 
 
 
 def calibrate(traces: Sequence[Trace], table: Calibration | None = None) -> Calibration:
-    """Choose the limits of `auto` by replaying recorded traces.
+    """Choose the limits of `auto` by replaying recorded traces; of equally good ones, those of fewest passes.
 
     table: whose table of noise levels to keep; without one it is read off the traces.
     """
     known = table or _with_table([(t.noise_std, t.distances[0]) for t in traces if t.noise_type == "gaussian"])
     choices = [replace(known, **dict(zip(_LIMITS, limits, strict=True))) for limits in product(*_LIMITS.values())]
-    return min(choices, key=lambda choice: loss(choice, traces))
+    return min(choices, key=lambda choice: (loss(choice, traces), sum(passes(choice, t) for t in traces)))
 
 
 def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
