@@ -63,6 +63,8 @@ def test_an_archive_of_solids_is_training_data(tmp_path: Path, monkeypatch: pyte
         # The archive's normals, and not planes through neighbours: across an edge those are neither face's.
         spacing = cKDTree(cloud).query(cloud, k=2)[0][:, 1]
         assert spacing.std() < 0.2 * spacing.mean()
+    twice = PatchSource.read(tmp_path / "a.npz", tmp_path / "a.npz", tmp_path / "b.npz")
+    assert len(twice.clouds) == 10  # a file given twice weighs twice
     with np.load(tmp_path / "a.npz") as archive:
         assert np.array_equal(source.surfaces[0].normals, archive["solid000/normals"].astype(np.float64))
 
