@@ -20,15 +20,15 @@ class Calibration:
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
     starts: d at the start above which a cloud gets a second, a third, ... pass, as the paper gives 1, 2 and 3.
-    polish: d at the start above which, while d is below settled, a cloud gets one pass, two, ... more. On thin and
-    intricate shapes d stays higher when the noise is gone, and further passes pull their sides together.
+    polish: the same for as long as d is below settled. On thin and intricate shapes d stays higher when the noise is
+    gone, and further passes pull their sides together.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
     noise: tuple[float, ...] = (0.0, 0.02)
     starts: tuple[float, ...] = (0.76, 0.905)
-    polish: tuple[float, ...] = (0.45,)
+    polish: tuple[float, ...] = (0.45, 0.76, 0.905)
     settled: float = 0.2
     stirred: float = 0.5
     most: int = 4
@@ -65,7 +65,7 @@ class Calibration:
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
-        polished = due + sum(start > limit for limit in self.polish)
+        polished = 1 + sum(start > limit for limit in self.polish)
         polishing = due <= done < polished and now < self.settled
         if done >= self.most or not (done < due or polishing or now > self.stirred):
             return 0
