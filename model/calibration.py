@@ -20,8 +20,9 @@ class Calibration:
 
     distances, noise: equally long, rising: the median d at a known noise std (unit-sphere frame).
     starts: d at the start above which a cloud gets a second, a third, ... pass, as the paper gives 1, 2 and 3.
-    polish: the same for as long as d is below settled. On thin and intricate shapes d stays higher when the noise is
-    gone, and further passes pull their sides together.
+    polish, settled: equally long; where d was above polish[i] at the start, pass i + 2 is made all the same if d is
+    below settled[i] by then. On thin and intricate shapes d stays higher when the noise is gone, and further passes
+    pull their sides together.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
@@ -29,7 +30,7 @@ class Calibration:
     noise: tuple[float, ...] = (0.0, 0.02)
     starts: tuple[float, ...] = (0.76, 0.905)
     polish: tuple[float, ...] = (0.45, 0.76, 0.905)
-    settled: float = 0.2
+    settled: tuple[float, ...] = (0.2, 0.2, 0.2)
     stirred: float = 0.5
     most: int = 4
 
@@ -37,6 +38,8 @@ class Calibration:
         """Refuse tables that cannot be looked up in."""
         if len(self.distances) != len(self.noise) or len(self.noise) < 2 or np.any(np.diff(self.distances) <= 0):
             raise MalformedFile("the calibration's distances must rise and be as many as its noise levels, 2 at least")
+        if len(self.polish) != len(self.settled):
+            raise MalformedFile(f"the calibration has {len(self.polish)} of polish and {len(self.settled)} of settled")
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Calibration:
@@ -66,7 +69,7 @@ class Calibration:
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
         polished = 1 + sum(start > limit for limit in self.polish)
-        polishing = due <= done < polished and now < self.settled
+        polishing = due <= done < polished and now < self.settled[done - 1]
         if done >= self.most or not (done < due or polishing or now > self.stirred):
             return 0
         return 1 if done == self.most - 1 or (polishing and done == polished - 1) else 2

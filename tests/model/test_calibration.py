@@ -55,8 +55,8 @@ def test_the_limits_are_those_under_which_recorded_clouds_end_best() -> None:
 
 
 def test_a_pass_that_makes_a_cloud_worse_than_its_input_costs_most() -> None:
-    worse = Trace("thin", 0.01, (0.4, 0.15, 0.1, 0.1, 0.1, 0.1), (5.0, 4.9, 5.5, 6.0, 6.0, 6.0))
-    others = Trace("smooth", 0.01, (0.4, 0.15, 0.1, 0.1, 0.1, 0.1), (9.0, 5.0, 4.5, 4.5, 4.5, 4.5))
+    worse = Trace("thin", 0.01, (0.25, 0.15, 0.1, 0.1, 0.1, 0.1), (5.0, 4.9, 5.5, 6.0, 6.0, 6.0))
+    others = Trace("smooth", 0.01, (0.25, 0.15, 0.1, 0.1, 0.1, 0.1), (9.0, 5.0, 4.5, 4.5, 4.5, 4.5))
     assert passes(calibrate([others]), others) == 2
     assert passes(calibrate([others, worse]), worse) == 1
 
@@ -64,7 +64,13 @@ def test_a_pass_that_makes_a_cloud_worse_than_its_input_costs_most() -> None:
 def test_a_calibration_survives_its_metadata_and_a_broken_one_is_refused() -> None:
     calibration = calibrate([trace(0.0, 0.1, 0.1), trace(0.01, 0.6, 0.1)])
     assert Calibration.from_metadata(calibration.to_metadata()) == calibration
-    for broken in ({"polished": 0.2}, {"distances": [0.5, 0.4], "noise": [0.0, 0.1]}, {"limits": [0.1]}, 7):
+    for broken in (
+        {"polished": 0.2},
+        {"distances": [0.5, 0.4], "noise": [0.0, 0.1]},
+        {"limits": [0.1]},
+        7,
+        {"settled": [0.2]},
+    ):
         with pytest.raises(MalformedFile):
             Calibration.from_metadata({"calibration": broken})
 
