@@ -64,9 +64,9 @@ def main() -> None:
         chamfer = " ".join(f"{1e4 * c:7.3f}" for c in t.chamfer)
         print(f"{t.cloud:18} {t.noise_type:8.8} {t.noise_std:7.4f}  {distances:32} {chamfer:42} {chosen:4} {best:4}")
     print(f"\n{'points, noise':>23} {'d':>7} {'auto / best CD':>15}")
-    levels = {(t.cloud.partition("/")[2], t.noise_type, t.noise_std) for t in traces}
-    for resolution, kind, std in sorted(levels):
-        those = [t for t in traces if (t.cloud.partition("/")[2], t.noise_type, t.noise_std) == (resolution, kind, std)]
+    for level in sorted({t.level for t in traces}):
+        resolution, kind, std = level
+        those = [t for t in traces if t.level == level]
         ratio = np.mean([t.chamfer[passes(calibration, t)] / max(min(t.chamfer[1:]), 1e-12) for t in those])
         print(f"{resolution:>6} {kind:8.8} {std:7.4f} {np.median([t.distances[0] for t in those]):7.3f} {ratio:15.3f}")
     print(json.dumps(calibration.to_metadata()))

@@ -23,7 +23,9 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
     "starts": tuple(product((0.45, 0.50, 0.55, 0.73), (0.88, 0.895, 0.905), (0.945,))),
     "polish": tuple(product((0.22, 0.26, 0.3), (0.58, 0.62, 0.66), (0.79, 0.83, 0.86), (0.88, 0.9, 0.92))),
     # Before the second and third pass, before the fourth and fifth.
-    "settled": tuple((few, few, many, many) for few, many in product((0.16, 0.18, 0.2, 0.22), (0.18, 0.2, 0.22, 0.25))),
+    "settled": tuple(
+        (few, few, many, many) for few, many in product((0.14, 0.16, 0.18, 0.2, 0.22), (0.18, 0.2, 0.22, 0.25))
+    ),
     "stirred": (0.5,),
     "most": (5,),
 }
@@ -44,6 +46,11 @@ class Trace:
     distances: tuple[float, ...]
     chamfer: tuple[float, ...]
     noise_type: str = "gaussian"
+
+    @property
+    def level(self) -> tuple[str, str, float]:
+        """The cell of a table: resolution (what follows the slash in the cloud's name), type and size of noise."""
+        return self.cloud.partition("/")[2], self.noise_type, self.noise_std
 
 
 def trace(
@@ -94,18 +101,17 @@ def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
 def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:
     """Rate `auto` on recorded traces: the mean log ratio of its CD to that of each cloud's best number of passes.
 
-    Every level of every type of noise at every resolution (what follows the slash in a cloud's name) weighs the same. A
-    cloud that is worse than its input weighs its log ratio to it ten times more. Clean clouds, whose best is no pass at
-    all, count by their CD in units of 1e-5.
+    Every level (`Trace.level`) weighs the same. A cloud that is worse than its input weighs its log ratio to it ten
+    times more. Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5.
     """
-    by_level: dict[tuple[str, float, str], list[float]] = {}
+    by_level: dict[tuple[str, str, float], list[float]] = {}
     for t in traces:
         reached = t.chamfer[passes(calibration, t)]
         if t.chamfer[0] > 0:
             rating = math.log(reached / min(t.chamfer[1:])) + 10 * max(0.0, math.log(reached / t.chamfer[0]))
         else:
             rating = reached / 1e-5
-        by_level.setdefault((t.noise_type, t.noise_std, t.cloud.partition("/")[2]), []).append(rating)
+        by_level.setdefault(t.level, []).append(rating)
     return float(np.mean([np.mean(ratings) for ratings in by_level.values()]))
 
 

@@ -55,8 +55,8 @@ def test_the_limits_are_those_under_which_recorded_clouds_end_best() -> None:
 
 
 def test_a_pass_that_makes_a_cloud_worse_than_its_input_costs_most() -> None:
-    worse = Trace("thin", 0.01, (0.25, 0.15, 0.1, 0.1, 0.1, 0.1), (5.0, 4.9, 5.5, 6.0, 6.0, 6.0))
-    others = Trace("smooth", 0.01, (0.25, 0.15, 0.1, 0.1, 0.1, 0.1), (9.0, 5.0, 4.5, 4.5, 4.5, 4.5))
+    worse = Trace("thin", 0.01, (0.6, 0.15, 0.1, 0.1, 0.1, 0.1), (5.0, 4.9, 5.5, 6.0, 6.0, 6.0))
+    others = Trace("smooth", 0.01, (0.6, 0.15, 0.1, 0.1, 0.1, 0.1), (9.0, 5.0, 4.5, 4.5, 4.5, 4.5))
     assert passes(calibrate([others]), others) == 2
     assert passes(calibrate([others, worse]), worse) == 1
 
