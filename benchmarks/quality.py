@@ -26,11 +26,11 @@ from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
+from straightpcf.model.train.calibrate import Trace, every_pass, passes
 from straightpcf.model.train.state import read_network
 from straightpcf.points.options import DenoiseOptions
 
 Floats = npt.NDArray[np.float64]
-Run = Callable[[Floats, float], tuple[Floats, int]]  # cloud, noise level -> cloud, passes
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 PAPER_ROWS = ("Score", "PDFlow", "DeepPSR", "IterativePFN", "StraightPCF")
@@ -38,8 +38,20 @@ OFFICIAL_STEPS = 4
 
 
 @dataclass(frozen=True)
+class Filtered:
+    """A cloud (N, 3) as it came out; every: with --every-pass, after 1, 2, ... passes."""
+
+    xyz: Floats
+    iterations: int
+    every: tuple[Floats, ...] = ()
+
+
+Run = Callable[[Floats, float], Filtered]  # cloud, noise level
+
+
+@dataclass(frozen=True)
 class Row:
-    """One shape at one noise level; distances x 1e4."""
+    """One shape at one noise level; distances x 1e4; every: CD and P2M after 1, 2, ... passes, if asked for."""
 
     shape: str
     resolution: int
@@ -50,6 +62,7 @@ class Row:
     p2m: float
     iterations: int
     seconds: float
+    every: tuple[tuple[float, float], ...] = ()
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -78,11 +91,12 @@ def _measure(shape: Shape, resolution: int, noise: float, options: argparse.Name
     made = options.noise_type != "gaussian" or noise not in shape.noisy
     noisy = make_noise(options.noise_type, shape.clean, noise, options.seed) if made else shape.noisy[noise]
     began = time.perf_counter()
-    denoised, iterations = run(noisy, noise)
+    filtered = run(noisy, noise)
     seconds = time.perf_counter() - began
     before = _distances(noisy, shape)
-    after = before if denoised is noisy else _distances(denoised, shape)
-    return Row(shape.name, resolution, noise, *before, *after, iterations, seconds)
+    after = before if filtered.xyz is noisy else _distances(filtered.xyz, shape)
+    every = tuple(_distances(xyz, shape) for xyz in filtered.every)
+    return Row(shape.name, resolution, noise, *before, *after, filtered.iterations, seconds, every)
 
 
 def _distances(cloud: Floats, shape: Shape) -> tuple[float, float]:
@@ -100,9 +114,9 @@ def _shapes(options: argparse.Namespace, resolution: int) -> list[Shape]:
 
 def _runner(options: argparse.Namespace) -> Run:
     if options.model == "noisy":
-        return lambda cloud, _: (cloud, 0)
+        return lambda cloud, _: Filtered(cloud, 0)
     if options.model == "jet":
-        return jet_smooth
+        return lambda cloud, noise: Filtered(*jet_smooth(cloud, noise))
     if options.model == "official":
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
         if not isinstance(module, VelocityModule):
@@ -114,12 +128,17 @@ def _runner(options: argparse.Namespace) -> Run:
         model = _ours(options)
     told = options.iterations == "told" or (options.iterations == "auto" and options.model == "official")
 
-    def run(cloud: Floats, noise: float) -> tuple[Floats, int]:
-        passes = str(max(1, round(100 * noise))) if told else options.iterations
-        result = model.denoise(cloud, DenoiseOptions.parse(iterations=passes, seed=str(options.seed)))
-        return result.xyz, result.iterations
+    def run(cloud: Floats, noise: float) -> Filtered:
+        wanted = str(max(1, round(100 * noise))) if told else options.iterations
+        result = model.denoise(cloud, DenoiseOptions.parse(iterations=wanted, seed=str(options.seed)))
+        return Filtered(result.xyz, result.iterations)
 
-    return run
+    def run_every(cloud: Floats, _: float) -> Filtered:
+        states, distances = every_pass(model, cloud, seed=options.seed)
+        chosen = passes(model.calibration, Trace("", 0.0, distances, ()))
+        return Filtered(states[chosen], chosen, tuple(states[1:]))
+
+    return run_every if options.every_pass else run
 
 
 def _ours(options: argparse.Namespace) -> Filter:
@@ -168,6 +187,8 @@ def _summary(rows: list[Row], resolution: int, noise: float, options: argparse.N
     seconds = np.mean([row.seconds for row in rows])
     print(f"{'mean':14s} {before[0]:9.3f} {before[1]:8.3f}  {after[0]:9.3f} {after[1]:8.3f}          {seconds:7.2f}")
     print(f"less than the noisy input: CD {less[0]:.1f} %, P2M {less[1]:.1f} %; passes (shapes x passes): {chosen}")
+    for done, (cd, p2m) in enumerate(np.mean([row.every for row in rows], axis=0) if options.every_pass else (), 1):
+        print(f"  passes: {done:<23d} {cd:9.3f} {p2m:8.3f}  auto's CD: {100 * (after[0] / cd - 1):+.1f} %")
     worse = [row.shape for row in rows if row.cd > row.noisy_cd or row.p2m > row.noisy_p2m]
     if worse:
         print(f"WORSE than the noisy input: {', '.join(worse)}")
@@ -208,6 +229,11 @@ def _parser() -> argparse.ArgumentParser:
         "--iterations",
         default="auto",
         help='"auto", a number of passes, or "told": 1, 2, 3 at 1, 2, 3 %%, as the paper',
+    )
+    parser.add_argument(
+        "--every-pass",
+        action="store_true",
+        help='"auto" beside every fixed number of passes, which it is cut from: seconds are those of all of them',
     )
     parser.add_argument("--euler-steps", type=int, help="N of the paper, 3 by default")
     parser.add_argument("--coverage", type=float, help="patches a point, 3 by default; the published scheme takes 6")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CloudFrame", "is_scene", "patch_scales", "zoom_of"]
+__all__ = ["LOUD_NOISE", "CloudFrame", "is_scene", "parts_of", "patch_scales", "zoom_of", "zoom_of_rest"]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training.md says how they were measured).
@@ -17,7 +17,14 @@ _USUAL_RADIUS = 0.25  # their median
 _SCENE_RADIUS = 0.1
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.03, 1.0
+_BEARABLE_NOISE = 0.044  # more is brought to this, whatever the limits
+# Noise above a fifth more than any in training leaves waves, longer than what d knows for noise: see `zoom_of_rest`.
+LOUD_NOISE = 0.036
+_WAVY, _SHOWN_REST, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
 _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
+# Of noise, in radii of a patch, for each part: see `parts_of`.
+_NOISE_A_PART = 0.062
+_MOST_PARTS, _SMALLEST_PART = 6, 2000
 _BLOCK = 2**16  # rows whose distances are held at once
 
 
@@ -66,9 +73,34 @@ def zoom_of(
     shown: the std that its noise is brought to, where limits allow it; smallest: the least factor.
     Noise and thin walls look alike, and a patch alone does not tell how much noise its cloud has. With the noise of
     every cloud brought to about one size, all else in a patch tells which it is (docs/training.md has the figures).
+    More noise than the network bears is made less, and the object smaller with it.
     """
+    if noise_std > _BEARABLE_NOISE:
+        return _BEARABLE_NOISE / noise_std
     largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
     return float(np.clip(shown / max(noise_std, 1e-9), smallest, largest))
+
+
+def zoom_of_rest(noise_std: float, at_half_size: float) -> float:
+    """Return the factor by which a later pass shows an object smaller, of which the first found more than LOUD_NOISE.
+
+    noise_std: read of it as it is; at_half_size: of a quarter of its points, shown at half their size. Where more is
+    seen there, what is left is longer than noise, and is brought to a size at which it looks like noise.
+    """
+    if at_half_size < _WAVY * noise_std:
+        return 1.0
+    return float(np.clip(_SHOWN_REST / max(at_half_size, 1e-9), _SMALLEST_REST_ZOOM, 1.0))
+
+
+def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> int:
+    """Return in how many parts a pass filters `count` points, each by itself: 1 where patches reach far enough.
+
+    noise_std, radii: in the unit ball, radii of some patches of the whole cloud. A patch is the 1000 nearest points,
+    however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
+    has patches of sqrt(m) times the radius, at the same cost (docs/training.md, "Parts").
+    """
+    wanted = round(noise_std / max(float(np.median(radii)), 1e-9) / _NOISE_A_PART)
+    return max(1, min(wanted, _MOST_PARTS, count // _SMALLEST_PART))
 
 
 def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1.0) -> npt.NDArray[np.float64]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from straightpcf.model.device_patches import cut_patches_on
 from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches, patches_around
 
-__all__ = ["Tiling", "split"]
+__all__ = ["Tiling", "parted", "split"]
 
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
@@ -39,6 +39,19 @@ def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np
     return tiles
 
 
+def parted(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]], parts: int) -> list[npt.NDArray[np.int64]]:
+    """Part (N, 3) points into clouds of N / parts rows, ascending, each as evenly spread as the whole.
+
+    Points are dealt out in the order of a k-d tree's leaves, where neighbours follow one another; tile by tile.
+    """
+    dealt: list[list[npt.NDArray[np.int64]]] = [[] for _ in range(parts)]
+    for rows in tiles:
+        order = rows[cKDTree(xyz[rows]).indices]
+        for part, into in enumerate(dealt):
+            into.append(order[part::parts])
+    return [np.sort(np.concatenate(rows)) for rows in dealt]
+
+
 class Tiling:
     """The patches of one pass over points xyz (N, 3), whose rows were parted into `tiles` by `split`.
 
@@ -56,7 +69,7 @@ class Tiling:
         seed: int,
         device: str = "cpu",
     ) -> None:
-        self._xyz, self._tiles = xyz, tiles
+        self._xyz, self.tiles = xyz, tiles
         cut = cut_patches if device == "cpu" else partial(cut_patches_on, torch.device(device))
         self._cut: Callable[[npt.NDArray[np.float64]], Patches] = partial(cut, coverage=coverage, seed=seed)
         self._margins: list[float] = []
@@ -65,7 +78,7 @@ class Tiling:
     @cached_property
     def whole(self) -> Patches | None:
         """The cut of the whole cloud, where it is one tile."""
-        if len(self._tiles) > 1:
+        if len(self.tiles) > 1:
             return None
         return self._cut(self._xyz)
 
@@ -75,7 +88,7 @@ class Tiling:
             step = max(1, len(self.whole.seeds) // count)
             return self.whole.every(step), range(0, len(self.whole.seeds), step)
         found, self._margins = [], []
-        for core in self._tiles:
+        for core in self.tiles:
             share = max(2, round(count * len(core) / len(self._xyz)))
             seeds = core[np.linspace(0, len(core) - 1, share).astype(np.int64)]
             patches = patches_around(cKDTree(self._xyz[core]), self._xyz[seeds], PATCH_SIZE)
@@ -99,10 +112,10 @@ class Tiling:
 
     def surroundings(self) -> Iterator[tuple[npt.NDArray[np.int64], int]]:
         """Yield each tile's rows, those of its halo behind, and how many are its own. Call `probes` before."""
-        if len(self._tiles) == 1:
-            yield self._tiles[0], len(self._tiles[0])
+        if len(self.tiles) == 1:
+            yield self.tiles[0], len(self.tiles[0])
             return
-        for core, margin in zip(self._tiles, self._margins, strict=True):
+        for core, margin in zip(self.tiles, self._margins, strict=True):
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
 
 

@@ -32,6 +32,18 @@ def test_quality(tmp_path: Path) -> None:
     assert 0 < row["cd"] < row["noisy_cd"]
 
 
+def test_quality_of_every_pass(tmp_path: Path) -> None:
+    options = ("--split", "validation", "--shapes", "sphere", "--resolution", 500, "--noise", 0.02, "--threads", 1)
+    rows = []
+    for more in ((), ("--every-pass",)):
+        printed("quality", *options, *more, "--json", tmp_path / "rows.json")
+        rows += json.loads((tmp_path / "rows.json").read_text())["rows"]
+    auto, cut = rows
+    assert (cut["iterations"], cut["cd"], cut["p2m"]) == (auto["iterations"], auto["cd"], auto["p2m"])
+    assert cut["every"][auto["iterations"] - 1] == [auto["cd"], auto["p2m"]]
+    assert len(cut["every"]) == 5
+
+
 def test_speed() -> None:
     said = printed("speed", "--shape", "sphere", "--resolution", 1500, "--patches", 1, "--threads", 1)
     ours, theirs = (

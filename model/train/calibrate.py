@@ -16,7 +16,7 @@ from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "loss", "noise_table", "passes", "trace"]
+__all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_table", "passes", "trace"]
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
@@ -62,12 +62,23 @@ def trace(
     noise_type: str = "gaussian",
 ) -> Trace:
     """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
-    run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"])))
+    states, distances = every_pass(filter_, noisy)
+    chamfer = tuple(chamfer_distance(x, clean) for x in states)
+    return Trace(name, noise_std, distances, chamfer, noise_type)
+
+
+def every_pass(
+    filter_: Filter, noisy: npt.NDArray[np.float64], *, seed: int = 0
+) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...]]:
+    """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and d before each and after the last.
+
+    As many passes as `calibrate` knows of.
+    """
+    run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"]), seed=seed))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
-    chamfer = tuple(chamfer_distance(x, clean) for x in states.values())
-    return Trace(name, noise_std, tuple(run.distances), chamfer, noise_type)
+    return list(states.values()), tuple(run.distances)
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, sphere, torus
@@ -156,9 +157,9 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
     assert len(seen) == 3
 
 
-@pytest.mark.parametrize(("far", "zooms"), [(0.0, 1), (100.0, 0)])  # an object; one far beside a stray point: a scene
+@pytest.mark.parametrize("far", [0.0, 100.0])  # an object; one far beside a stray point: a scene
 def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
-    shipped: Filter, monkeypatch: pytest.MonkeyPatch, far: float, zooms: int
+    shipped: Filter, monkeypatch: pytest.MonkeyPatch, far: float
 ) -> None:
     seen: list[float] = []
 
@@ -168,9 +169,53 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
 
     monkeypatch.setattr("straightpcf.model.filter.zoom_of", zoom)
     cloud = np.concatenate([noisy(torus(3000), 0.02), [[far, 0, 0]]])
-    shipped.denoise(cloud, DenoiseOptions(iterations=2))
-    assert len(seen) == zooms
-    assert all(0.015 < noise < 0.03 for noise in seen)
+    shipped.denoise(cloud, ONE_PASS)
+    assert bool(seen) == (far == 0.0)
+    assert all(0.015 < noise < 0.03 for noise in seen[:1])
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.05, 0.08])
+def test_more_noise_than_any_in_training_is_read_and_taken_away(shipped: Filter, noise: float) -> None:
+    cloud = noisy(torus(8000), noise)
+    result = shipped.denoise(cloud, DenoiseOptions(iterations=2))
+    before, after = (np.square(distance_to_torus(x)).mean() for x in (cloud, result.xyz))
+    assert result.noise_before == pytest.approx(noise, rel=0.35)
+    assert after < 0.25 * before
+
+
+def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
+    shipped: Filter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strip = np.random.default_rng(0).uniform([-1, -0.15, 0], [1, 0.15, 0], (10_000, 3))
+    cloud = noisy(strip, 0.03)
+    wanted: list[int] = []
+
+    def parts(*given: Any) -> int:
+        wanted.append(parts_of(*given))
+        return wanted[-1]
+
+    monkeypatch.setattr("straightpcf.model.filter.parts_of", parts)
+    two = DenoiseOptions(iterations=2)
+    parted = shipped.denoise(cloud, two).xyz
+    monkeypatch.setattr("straightpcf.model.filter.parts_of", lambda *_: 1)
+    whole = shipped.denoise(cloud, two).xyz
+    assert wanted[0] > 1
+    off = [np.square(xyz[np.abs(strip[:, 1]) < 0.1, 2]).mean() for xyz in (parted, whole)]
+    assert off[0] < 0.8 * off[1], off
+
+
+def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
+    tiny: Filter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("straightpcf.model.filter.parts_of", lambda *_: 3)
+    cloud = noisy(torus(33_000), 0.01)
+    options = DenoiseOptions(iterations=1)
+    results = [
+        Filter(tiny.network, threads=threads, coverage=2, tile_points=10_000).denoise(cloud, options)
+        for threads in (1, 2)
+    ]
+    assert results[0].xyz.tobytes() == results[1].xyz.tobytes()
+    assert not np.array_equal(results[0].xyz, cloud)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

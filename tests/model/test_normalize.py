@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from straightpcf.model.normalize import is_scene, patch_scales, zoom_of
+from straightpcf.model.normalize import is_scene, parts_of, patch_scales, zoom_of
 
 
 def test_an_objects_patches_keep_the_papers_frame() -> None:
@@ -32,6 +34,27 @@ def test_noise_is_brought_to_one_size() -> None:
     np.testing.assert_allclose(shown, shown[0])
 
 
-@pytest.mark.parametrize(("noise", "radius", "zoom"), [(0.1, 0.2, 1), (0.0, 0.2, 2.5), (0.0, 0.5, 1.3), (0.0, 0.9, 1)])
+@pytest.mark.parametrize(
+    ("noise", "radius", "zoom"), [(0.035, 0.2, 1), (0.0, 0.2, 2.5), (0.0, 0.5, 1.3), (0.0, 0.9, 1)]
+)
 def test_a_zoom_has_limits_of_its_own_and_of_the_patches(noise: float, radius: float, zoom: float) -> None:
     assert zoom_of(noise, np.array([radius])) == pytest.approx(zoom)
+
+
+@pytest.mark.parametrize("noise", [0.04, 0.1, 1.0])
+def test_noise_that_no_network_bears_is_shown_as_less(noise: float) -> None:
+    assert 0.025 < noise * zoom_of(noise, np.array([0.2])) < 0.03
+
+
+def test_a_cloud_is_parted_where_patches_are_small_beside_the_noise() -> None:
+    assert parts_of(0.01, np.array([0.1]), 50_000) == 2
+    assert parts_of(0.03, np.array([0.17]), 50_000) == 3
+    assert parts_of(0.03, np.array([0.4]), 10_000) == 1
+    assert parts_of(0.0, np.array([0.0]), 10_000) == 1
+
+
+@given(st.floats(0, 1), st.floats(0, 1), st.integers(1, 200_000))
+def test_no_part_is_too_small(noise: float, radius: float, count: int) -> None:
+    parts = parts_of(noise, np.array([radius]), count)
+    assert parts == 1 or count / parts >= 2000
+    assert 1 <= parts <= 6

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.spread import spread
-from straightpcf.model.tiles import Tiling, split
+from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, torus
@@ -24,6 +24,26 @@ def test_every_row_is_in_one_tile_and_none_is_too_large(count: int, tile_points:
     tiles = split(xyz, tile_points)
     assert np.array_equal(np.sort(np.concatenate(tiles)), np.arange(count))
     assert max(map(len, tiles)) <= tile_points
+
+
+@settings(max_examples=25, deadline=None)
+@given(count=st.integers(1, 3000), tile_points=st.integers(100, 3000), parts=st.integers(1, 6), equal=st.booleans())
+def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, equal: bool) -> None:
+    xyz = np.zeros((count, 3)) if equal else torus(count)
+    tiles = split(xyz, tile_points)
+    rows = parted(xyz, tiles, parts)
+    assert np.array_equal(np.sort(np.concatenate(rows)), np.arange(count))
+    assert max(map(len, rows)) - min(map(len, rows)) <= len(tiles)
+    assert all((np.diff(part) > 0).all() for part in rows)
+
+
+def test_parts_are_as_evenly_spread_as_the_whole() -> None:
+    xyz = torus(12_000)
+    for part in parted(xyz, split(xyz, 4000), 3):
+        alone = cKDTree(xyz[part])
+        among = [len(near) for near in alone.query_ball_point(xyz[::50], 0.15)]
+        of_all = [len(near) for near in cKDTree(xyz).query_ball_point(xyz[::50], 0.15)]
+        np.testing.assert_allclose(3 * np.array(among), of_all, rtol=0.35)
 
 
 def test_every_point_is_owned_once_by_patches_of_its_own_tiles_cut() -> None:
