@@ -17,7 +17,8 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.normalize import LOUD_NOISE, CloudFrame, is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
+from straightpcf.model.noise import NoiseReader, Reading
+from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
 from straightpcf.model.patches import Patches
@@ -37,12 +38,6 @@ FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; th
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
-_PROBES = 48  # patches on which "auto" reads the noise
-# d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
-# From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
-# smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
-_AGAIN_ZOOMS, _AGAIN_PROBES, _AGAIN_POINTS = (0.5, 0.25), 24, 2500
-_AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
 
 
 @dataclass(frozen=True)
@@ -222,11 +217,8 @@ class Run:
         self.points = _Distinct(finite)
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
-        self.noise = [0.0, 0.0]
-        self.distances: list[float] = []
-        self.scene = False
-        self.zoom, self.parts = 1.0, 1  # of the pass that comes
-        self.probed: dict[int, float] = {}  # what the DistanceModule said of patches of the pass that comes, by number
+        self.readings: list[Reading] = []  # before each pass, and after the last
+        self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
@@ -241,9 +233,7 @@ class Run:
             evened = self._evened(here, tiling, planned)
             here += evened
             tiling = self._tiling(here, tiles)
-            self.noise[1] = self._noise(here, tiling)
-            if self.iterations == 0:
-                self.noise[0] = self.noise[1]
+            self.readings.append(self.reader.read(here, tiling, self.readings[0] if self.readings else None))
             left = self._passes_left(planned)
             if left == 0:
                 return
@@ -259,10 +249,15 @@ class Run:
         warnings = [f"{untouched} points are not finite and were passed through"] if untouched else []
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
-        before, after = (self.frame.radius * noise for noise in self.noise)
+        noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
         return DenoiseResult(
-            out, self.iterations, before, after, tuple(self.distances), untouched, seconds, tuple(warnings)
+            out, self.iterations, noise[0], noise[-1], self.distances, untouched, seconds, tuple(warnings)
         )
+
+    @property
+    def distances(self) -> tuple[float, ...]:
+        """The DistanceModule's median before each pass and after the last."""
+        return tuple(reading.distance for reading in self.readings)
 
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
@@ -277,17 +272,17 @@ class Run:
         Not before the first, nor in a scene: scan lines are no clumps. d is read of the points so spread, also where
         no pass comes after.
         """
-        if tiling is None or not self.filter.even or self.iterations == planned or self.scene:
+        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].scene:
             return 0.0
-        return self.filter.processor.spread(here, tiling, _EVENED * self.noise[0])
+        return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
 
     def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
-        settled = 0
+        settled, shown = 0, self.readings[-1]
         # The patches are cut from `here`, so results may be written into self.moved as they come.
-        for cut in self._cuts(here, tiling):
-            scales = patch_scales(cut.radii, scene=self.scene, zoom=self.zoom)
-            for patch, displacement in self.filter.processor.displacements(here, cut, scales, self.probed):
+        for cut in self._cuts(here, tiling, shown.parts):
+            scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
+            for patch, displacement in self.filter.processor.displacements(here, cut, scales, shown.probed):
                 owned = cut.owned_points(patch)
                 self.moved[owned] += displacement / scales[patch]
                 settled += len(owned)
@@ -298,69 +293,19 @@ class Run:
                 progress = (done_before + settled / len(here)) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
 
-    def _cuts(self, here: npt.NDArray[np.float64], tiling: Tiling) -> Iterator[Patches]:
-        """Cut the pass that comes: the whole cloud, or part after part."""
-        if self.parts == 1:
+    def _cuts(self, here: npt.NDArray[np.float64], tiling: Tiling, parts: int) -> Iterator[Patches]:
+        """Cut a pass: the whole cloud, or part after part."""
+        if parts == 1:
             yield from tiling.cuts()
             return
-        for rows in parted(here, tiling.tiles, self.parts):
-            part = self._tiling(here[rows])
-            part.probes(_PROBES)
-            for cut in part.cuts():
+        for rows in parted(here, tiling.tiles, parts):
+            for cut in self._tiling(here[rows]).cuts():
                 yield cut.of_rows(rows)
 
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
         owner = self.filter
         tiles = tiles or split(xyz, owner.tile_points)
         return Tiling(xyz, tiles, coverage=owner.coverage, seed=self.options.seed, device=owner.device)
-
-    def _noise(self, here: npt.NDArray[np.float64], tiling: Tiling) -> float:
-        """Read the DistanceModule on a sample of patches: the noise std in the unit-ball frame.
-
-        Sets how the pass that comes shows an object. Before the first pass d is read a second time, in the size that
-        the first reading asks for.
-        """
-        probes, numbers = tiling.probes(_PROBES)
-        self.scene = is_scene(probes.radii)
-        self.zoom, self.parts = 1.0, 1
-        scales = patch_scales(probes.radii, scene=self.scene)
-        distances = self.filter.processor.distances(here, probes, scales)
-        self.distances.append(float(np.median(distances)))
-        noise = float(np.median(self.filter.calibration.noise_std(distances) / scales))
-        if self.filter.zoom and not self.scene:
-            if self.iterations == 0:
-                noise = self._read_again(here, tiling, noise)
-                self.zoom, self.parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
-            elif self.noise[0] > LOUD_NOISE and noise > _AGAIN_FROM * self.filter.calibration.noise[-1]:
-                self.zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
-        if self.parts > 1:
-            numbers = range(0)
-        elif self.zoom != 1.0:
-            zoomed = patch_scales(probes.radii, scene=False, zoom=self.zoom)
-            distances = self.filter.processor.distances(here, probes, zoomed)
-        self.probed = dict(zip(numbers, distances.tolist(), strict=False))
-        return noise
-
-    def _read_again(self, here: npt.NDArray[np.float64], tiling: Tiling, noise: float) -> float:
-        """Return the noise of an object where it may be more than the table knows."""
-        most, enough = self.filter.calibration.noise[-1], _AGAIN_FROM
-        for zoom in _AGAIN_ZOOMS:
-            if noise < enough * most:
-                break
-            again = self._made_smaller(here, tiling, zoom)
-            if again < _AGAIN_ABOVE * most:
-                break
-            noise, most, enough = again, self.filter.calibration.noise[-1] / zoom, _AGAIN_ABOVE
-        return noise
-
-    def _made_smaller(self, here: npt.NDArray[np.float64], tiling: Tiling, zoom: float) -> float:
-        """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
-        parts = min(round(1 / zoom**2), len(here) // _AGAIN_POINTS)
-        some = here[parted(here, tiling.tiles, max(1, parts))[0]]
-        probes, _ = self._tiling(some).probes(_AGAIN_PROBES)
-        scales = patch_scales(probes.radii, scene=False, zoom=zoom)
-        distances = self.filter.processor.distances(some, probes, scales)
-        return float(np.median(self.filter.calibration.noise_std(distances) / scales))
 
 
 class _Distinct:

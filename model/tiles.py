@@ -18,6 +18,7 @@ __all__ = ["Tiling", "parted", "split"]
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
 _SPARSEST = 90  # percentile of a tile's patch radii that its halo is made for
+_MEASURED = 48  # patches, where none were probed before
 
 
 def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np.int64]]:
@@ -97,7 +98,7 @@ class Tiling:
         return Patches.joined(found), range(0)
 
     def cuts(self) -> Iterator[Patches]:
-        """Cut tile after tile; together the patches own every point once. Call `probes` before."""
+        """Cut tile after tile; together the patches own every point once."""
         if self.whole is not None:
             yield self.whole
             return
@@ -111,10 +112,12 @@ class Tiling:
             yield cut
 
     def surroundings(self) -> Iterator[tuple[npt.NDArray[np.int64], int]]:
-        """Yield each tile's rows, those of its halo behind, and how many are its own. Call `probes` before."""
+        """Yield each tile's rows, those of its halo behind, and how many are its own."""
         if len(self.tiles) == 1:
             yield self.tiles[0], len(self.tiles[0])
             return
+        if not self._margins:
+            self.probes(_MEASURED)
         for core, margin in zip(self.tiles, self._margins, strict=True):
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
 

@@ -167,7 +167,7 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
         seen.append(noise_std)
         return 1.0
 
-    monkeypatch.setattr("straightpcf.model.filter.zoom_of", zoom)
+    monkeypatch.setattr("straightpcf.model.noise.zoom_of", zoom)
     cloud = np.concatenate([noisy(torus(3000), 0.02), [[far, 0, 0]]])
     shipped.denoise(cloud, ONE_PASS)
     assert bool(seen) == (far == 0.0)
@@ -194,7 +194,7 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
         wanted.append(parts_of(*given))
         return wanted[-1]
 
-    monkeypatch.setattr("straightpcf.model.filter.parts_of", parts)
+    monkeypatch.setattr("straightpcf.model.noise.parts_of", parts)
     filtered, seen = cloud.copy(), []
     for patch in shipped.patches(cloud, ONE_PASS):
         filtered[patch.indices] = patch.xyz
@@ -208,7 +208,7 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
 def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
     tiny: Filter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("straightpcf.model.filter.parts_of", lambda *_: 3)
+    monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_: 3)
     cloud = noisy(torus(33_000), 0.01)
     options = DenoiseOptions(iterations=1)
     results = [

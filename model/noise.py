@@ -1,0 +1,96 @@
+"""How noisy a cloud is, read by the DistanceModule, and how the pass that comes shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from straightpcf.model.calibration import Calibration
+from straightpcf.model.normalize import LOUD_NOISE, is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
+from straightpcf.model.processor import Floats, Processor
+from straightpcf.model.tiles import Tiling, parted
+
+__all__ = ["NoiseReader", "Reading"]
+
+_PROBES = 48  # patches on which d is read
+# d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
+# From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
+# smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
+_AGAIN_ZOOMS, _AGAIN_PROBES, _AGAIN_POINTS = (0.5, 0.25), 24, 2500
+_AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was read of a cloud before a pass.
+
+    distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
+    object seen whole; zoom: the factor by which the pass shows an object larger; parts: in how many it filters it;
+    probed: what the DistanceModule said of patches of that pass, by number.
+    """
+
+    distance: float
+    noise_std: float
+    scene: bool
+    zoom: float = 1.0
+    parts: int = 1
+    probed: Mapping[int, float] = field(default_factory=dict)
+
+
+class NoiseReader:
+    """Reads clouds in the unit ball, (N, 3) float64, with one network on one processor."""
+
+    def __init__(
+        self, processor: Processor, calibration: Calibration, tile: Callable[[Floats], Tiling], *, zoom: bool
+    ) -> None:
+        """tile: cuts some of the points into patches. zoom: whether objects are shown in the size of their noise."""
+        self._processor, self._calibration, self._tile, self._zoom = processor, calibration, tile, zoom
+        self._most = float(calibration.noise[-1])
+
+    def read(self, here: Floats, tiling: Tiling, first: Reading | None) -> Reading:
+        """Read the noise of a cloud; first: the reading before the first pass, None where this is it.
+
+        Where the pass shows the whole cloud in another size than that of the reading, d is read in that size, too.
+        """
+        probes, numbers = tiling.probes(_PROBES)
+        scene = is_scene(probes.radii)
+        scales = patch_scales(probes.radii, scene=scene)
+        distances = self._processor.distances(here, probes, scales)
+        distance, noise = float(np.median(distances)), self._noise_std(distances, scales)
+        zoom, parts = 1.0, 1
+        if self._zoom and not scene:
+            if first is None:
+                noise = self._read_again(here, tiling, noise)
+                zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
+            elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
+                zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
+        if parts > 1:  # of other patches
+            return Reading(distance, noise, scene, zoom, parts)
+        if zoom != 1.0:
+            distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
+        return Reading(distance, noise, scene, zoom, 1, dict(zip(numbers, distances.tolist(), strict=False)))
+
+    def _read_again(self, here: Floats, tiling: Tiling, noise: float) -> float:
+        """Return the noise of an object where it may be more than the table knows."""
+        most, enough = self._most, _AGAIN_FROM
+        for zoom in _AGAIN_ZOOMS:
+            if noise < enough * most:
+                break
+            again = self._made_smaller(here, tiling, zoom)
+            if again < _AGAIN_ABOVE * most:
+                break
+            noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
+        return noise
+
+    def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
+        """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
+        parts = min(round(1 / zoom**2), len(here) // _AGAIN_POINTS)
+        some = here[parted(here, tiling.tiles, max(1, parts))[0]]
+        probes, _ = self._tile(some).probes(_AGAIN_PROBES)
+        scales = patch_scales(probes.radii, scene=False, zoom=zoom)
+        return self._noise_std(self._processor.distances(some, probes, scales), scales)
+
+    def _noise_std(self, distances: Floats, scales: Floats) -> float:
+        return float(np.median(self._calibration.noise_std(distances) / scales))
