@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from straightpcf.model.normalize import is_scene, parts_of, patch_scales, zoom_of
+from straightpcf.model.normalize import is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
 
 
 def test_an_objects_patches_keep_the_papers_frame() -> None:
@@ -41,9 +41,16 @@ def test_a_zoom_has_limits_of_its_own_and_of_the_patches(noise: float, radius: f
     assert zoom_of(noise, np.array([radius])) == pytest.approx(zoom)
 
 
-@pytest.mark.parametrize("noise", [0.04, 0.1, 1.0])
+@pytest.mark.parametrize("noise", [0.05, 0.1, 1.0])
 def test_noise_that_no_network_bears_is_shown_as_less(noise: float) -> None:
-    assert 0.025 < noise * zoom_of(noise, np.array([0.2])) < 0.03
+    assert noise * zoom_of(noise, np.array([0.2])) == pytest.approx(0.044)
+    assert zoom_of(0.044, np.array([0.2])) == 1.0
+
+
+def test_waves_that_noise_has_left_are_shown_smaller() -> None:
+    assert zoom_of_rest(0.02, at_half_size=0.021) == 1.0  # no more than noise of that size would read
+    assert zoom_of_rest(0.02, at_half_size=0.026) == pytest.approx(0.5)
+    assert zoom_of_rest(0.02, at_half_size=0.1) == pytest.approx(0.4)
 
 
 def test_a_cloud_is_parted_where_patches_are_small_beside_the_noise() -> None:
