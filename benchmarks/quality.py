@@ -70,6 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
+    if options.every_pass and (options.model, options.iterations) != ("ours", "auto"):
+        raise SystemExit("--every-pass takes `auto` of this project's model apart: no other --model or --iterations")
     run = _runner(options)
     rows = []
     for resolution in options.resolution:

@@ -14,7 +14,6 @@ from straightpcf.model.tiles import Tiling, parted
 
 __all__ = ["NoiseReader", "Reading"]
 
-_PROBES = 48  # patches on which d is read
 # d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
 # From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
 # smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
@@ -54,7 +53,7 @@ class NoiseReader:
 
         Where the pass shows the whole cloud in another size than that of the reading, d is read in that size, too.
         """
-        probes, numbers = tiling.probes(_PROBES)
+        probes, numbers = tiling.probes()
         scene = is_scene(probes.radii)
         scales = patch_scales(probes.radii, scene=scene)
         distances = self._processor.distances(here, probes, scales)

@@ -17,7 +17,7 @@ _USUAL_RADIUS = 0.25  # their median
 _SCENE_RADIUS = 0.1
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.03, 1.0
-_BEARABLE_NOISE = 0.044  # more is brought to this, whatever the limits
+_BEARABLE_NOISE = 0.044  # more is brought to this, below the least factor, too
 # Noise above a fifth more than any in training leaves waves, longer than what d knows for noise: see `zoom_of_rest`.
 LOUD_NOISE = 0.036
 _WAVY, _SHOWN_REST, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
@@ -75,10 +75,9 @@ def zoom_of(
     every cloud brought to about one size, all else in a patch tells which it is (docs/training.md has the figures).
     More noise than the network bears is made less, and the object smaller with it.
     """
-    if noise_std > _BEARABLE_NOISE:
-        return _BEARABLE_NOISE / noise_std
     largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
-    return float(np.clip(shown / max(noise_std, 1e-9), smallest, largest))
+    noise_std = max(noise_std, 1e-9)
+    return float(np.clip(shown / noise_std, min(smallest, _BEARABLE_NOISE / noise_std), largest))
 
 
 def zoom_of_rest(noise_std: float, at_half_size: float) -> float:

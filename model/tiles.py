@@ -18,7 +18,7 @@ __all__ = ["Tiling", "parted", "split"]
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
 _SPARSEST = 90  # percentile of a tile's patch radii that its halo is made for
-_MEASURED = 48  # patches, where none were probed before
+_PROBES = 48  # patches that are looked at to know a cloud
 
 
 def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np.int64]]:
@@ -83,7 +83,7 @@ class Tiling:
             return None
         return self._cut(self._xyz)
 
-    def probes(self, count: int) -> tuple[Patches, range]:
+    def probes(self, count: int = _PROBES) -> tuple[Patches, range]:
         """Return about `count` patches spread over the cloud, to look at, and which of the whole cut they are."""
         if self.whole is not None:
             step = max(1, len(self.whole.seeds) // count)
@@ -117,7 +117,7 @@ class Tiling:
             yield self.tiles[0], len(self.tiles[0])
             return
         if not self._margins:
-            self.probes(_MEASURED)
+            self.probes()
         for core, margin in zip(self.tiles, self._margins, strict=True):
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
 

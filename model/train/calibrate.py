@@ -79,7 +79,7 @@ def every_pass(
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
-    return list(states.values()), tuple(run.distances)
+    return list(states.values()), run.distances
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
