@@ -23,6 +23,7 @@ from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
+from straightpcf.model.restraint import reaches, restrained
 from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
@@ -282,9 +283,15 @@ class Run:
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for cut in self._cuts(here, tiling, shown.parts):
             scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
-            for patch, displacement in self.filter.processor.displacements(here, cut, scales, shown.probed):
+            probed, believed = shown.probed, None
+            if shown.scene:
+                probed, believed = self._believed(here, cut, scales)
+            for patch, displacement in self.filter.processor.displacements(here, cut, scales, probed):
                 owned = cut.owned_points(patch)
-                self.moved[owned] += displacement / scales[patch]
+                step = displacement / scales[patch]
+                if believed is not None:
+                    step = restrained(self.moved[owned], step, believed[patch])
+                self.moved[owned] += step
                 settled += len(owned)
                 copies = self.points.copies(owned)
                 indices = self.rows[copies]
@@ -292,6 +299,14 @@ class Run:
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
                 progress = (done_before + settled / len(here)) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
+
+    def _believed(
+        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]
+    ) -> tuple[dict[int, float], npt.NDArray[np.float64]]:
+        """Return what the DistanceModule says of a scene's patches, by number, and the noise std believed of each."""
+        distances = self.filter.processor.distances(here, cut, scales)
+        noise = self.reader.noise_stds(distances, scales)
+        return dict(enumerate(distances.tolist())), reaches(here, cut, noise, self.readings[0].usual)
 
     def _cuts(self, here: npt.NDArray[np.float64], tiling: Tiling, parts: int) -> Iterator[Patches]:
         """Cut a pass: the whole cloud, or part after part."""

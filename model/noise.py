@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.normalize import LOUD_NOISE, is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
@@ -19,6 +20,7 @@ __all__ = ["NoiseReader", "Reading"]
 # smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
 _AGAIN_ZOOMS, _AGAIN_PROBES, _AGAIN_POINTS = (0.5, 0.25), 24, 2500
 _AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
+_MOST_POINTS = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Reading:
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
     object seen whole; zoom: the factor by which the pass shows an object larger; parts: in how many it filters it;
-    probed: what the DistanceModule said of patches of that pass, by number.
+    probed: what the DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a
+    scene's points have, or less.
     """
 
     distance: float
@@ -36,6 +39,7 @@ class Reading:
     zoom: float = 1.0
     parts: int = 1
     probed: Mapping[int, float] = field(default_factory=dict)
+    usual: float = 0.0
 
 
 class NoiseReader:
@@ -54,12 +58,16 @@ class NoiseReader:
         Where the pass shows the whole cloud in another size than that of the reading, d is read in that size, too.
         """
         probes, numbers = tiling.probes()
-        scene = is_scene(probes.radii)
+        scene = is_scene(_quantile(probes.radii, probes.owned, 0.5))
         scales = patch_scales(probes.radii, scene=scene)
         distances = self._processor.distances(here, probes, scales)
-        distance, noise = float(np.median(distances)), self._noise_std(distances, scales)
+        distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
+        if scene:
+            noise, usual = (_quantile(self.noise_stds(distances, scales), probes.owned, q) for q in (0.5, _MOST_POINTS))
+            return Reading(distance, noise, scene, probed=known, usual=usual)
+        noise = self._noise_std(distances, scales)
         zoom, parts = 1.0, 1
-        if self._zoom and not scene:
+        if self._zoom:
             if first is None:
                 noise = self._read_again(here, tiling, noise)
                 zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
@@ -69,7 +77,12 @@ class NoiseReader:
             return Reading(distance, noise, scene, zoom, parts)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
-        return Reading(distance, noise, scene, zoom, 1, dict(zip(numbers, distances.tolist(), strict=False)))
+            known = dict(zip(numbers, distances.tolist(), strict=False))
+        return Reading(distance, noise, scene, zoom, 1, known)
+
+    def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
+        """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
+        return self._calibration.noise_std(distances) / scales
 
     def _read_again(self, here: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""
@@ -92,4 +105,14 @@ class NoiseReader:
         return self._noise_std(self._processor.distances(some, probes, scales), scales)
 
     def _noise_std(self, distances: Floats, scales: Floats) -> float:
-        return float(np.median(self._calibration.noise_std(distances) / scales))
+        return float(np.median(self.noise_stds(distances, scales)))
+
+
+def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> float:
+    """Return what a share of the points has, or less: values (M,) of patches that own (M,) points; none own any: even.
+
+    Patches lie evenly in space, points do not: a LiDAR frame's few far ones have most of the patches.
+    """
+    order = np.argsort(values)
+    below = np.cumsum(owned[order] if owned.any() else np.ones(len(order)))
+    return float(values[order][np.searchsorted(below, share * below[-1])])

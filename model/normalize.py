@@ -53,12 +53,12 @@ class CloudFrame:
         return out
 
 
-def is_scene(radii: npt.NDArray[np.float64]) -> bool:
-    """Say of a cloud, by the radii of some of its patches in the unit ball, whether it is no object seen whole.
+def is_scene(radius: float) -> bool:
+    """Say of a cloud, by the radius in the unit ball of the patches of most points, whether it is no object seen whole.
 
     A street or a LiDAR frame has patches far smaller beside its bounding sphere than any in training.
     """
-    return float(np.median(radii)) < _SCENE_RADIUS
+    return radius < _SCENE_RADIUS
 
 
 def zoom_of(

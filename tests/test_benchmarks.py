@@ -57,3 +57,11 @@ def test_speed() -> None:
 def test_scaling() -> None:
     rows = [line.split() for line in printed("scaling", "--points", 500, 1000, "--threads", 1).splitlines()[2:]]
     assert [row[0] for row in rows] == ["500", "1000"]
+
+
+def test_scenes(tmp_path: Path) -> None:
+    printed("scenes", "depth", "--every", 80, "--iterations", 1, "--threads", 1, "--json", tmp_path / "rows.json")
+    whole, *parts = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert whole["points"] > 1000
+    assert {"ground", "wall"} <= {row["part"] for row in parts}
+    assert 0 < whole["after"] < 2 * whole["before"]

@@ -1,0 +1,58 @@
+"""What would move much farther than a scene's noise reaches stays where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.model.patches import Patches
+from straightpcf.model.restraint import reaches, restrained
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import noisy
+
+
+def one_patch(count: int) -> Patches:
+    rows = np.arange(count, dtype=np.int32)[None]
+    return Patches(np.array([0]), rows, np.array([count]), np.array([1.0]))
+
+
+def test_a_step_is_whole_up_to_two_noise_stds_and_none_from_three_on() -> None:
+    step = np.array([[0.5, 0, 0], [0, 2.0, 0], [0, 0, 2.5], [3.0, 0, 0], [0, 9.0, 0]])
+    shares = np.linalg.norm(restrained(np.zeros((5, 3)), step, 1.0), axis=1) / np.linalg.norm(step, axis=1)
+    np.testing.assert_allclose(shares, [1, 1, 0.5, 0, 0])
+
+
+def test_earlier_passes_count_and_a_step_back_is_free() -> None:
+    moved = np.array([[2.0, 0, 0], [2.0, 0, 0]])
+    np.testing.assert_allclose(restrained(moved, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 1.0), [[0, 0, 0], [-1, 0, 0]])
+
+
+def test_without_noise_nothing_moves() -> None:
+    np.testing.assert_array_equal(restrained(np.zeros((2, 3)), np.array([[1e-6, 0, 0], [0, 0, 0]]), 0.0), 0.0)
+
+
+def test_more_than_the_usual_noise_is_believed_of_a_sheet_only_and_not_without_limit() -> None:
+    rng = np.random.default_rng(0)
+    sheet = rng.uniform(-1, 1, (1000, 3)) * [1, 1, 0] + [0, 0, 1] * (0.1 * rng.standard_normal((1000, 1)))
+    ball = rng.uniform(-1, 1, (1000, 3))
+    patch = one_patch(1000)
+    assert reaches(sheet, patch, np.array([0.1]), 0.04) == 0.1
+    assert reaches(sheet, patch, np.array([0.1]), 0.02) == pytest.approx(0.06)
+    assert reaches(ball, patch, np.array([0.1]), 0.04) == 0.04
+    assert reaches(sheet, patch, np.array([0.01]), 0.04) == 0.04
+
+
+def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-5, -5, 0], [5, 5, 0], (6000, 3))
+    wire = np.stack([np.linspace(-4, 4, 60), np.zeros(60), np.full(60, 1.0)], axis=1)
+    far = [[300.0, 0, 0]]  # beside which patches are those of a scene
+    result = load_filter(device="cpu").denoise(
+        np.concatenate([noisy(ground, 0.05), noisy(wire, 0.05), far]), DenoiseOptions(iterations=1)
+    )
+    height = result.xyz[:6000, 2]
+    assert np.sqrt(np.mean(height**2)) < 0.4 * 0.05
+    off = np.linalg.norm((result.xyz[6000:6060] - wire)[:, 1:], axis=1)
+    assert np.sqrt(np.mean(off**2)) < 1.5 * np.sqrt(2) * 0.05
+    assert result.noise_before == pytest.approx(0.05, rel=0.35)
