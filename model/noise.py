@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.normalize import LOUD_NOISE, is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
+from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
 from straightpcf.model.tiles import Tiling, parted
 
@@ -63,8 +64,12 @@ class NoiseReader:
         distances = self._processor.distances(here, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         if scene:
-            noise, usual = (_quantile(self.noise_stds(distances, scales), probes.owned, q) for q in (0.5, _MOST_POINTS))
-            return Reading(distance, noise, scene, probed=known, usual=usual)
+            noise, usual = self._noise_of_scene(probes, distances, scales)
+            parts = 1
+            if first is None and np.isinf(usual):
+                noise, usual = self._read_scene_again(here, tiling, noise)
+                parts = parts_of(noise, probes.radii, len(here))
+            return Reading(distance, noise, scene, parts=parts, probed=known if parts == 1 else {}, usual=usual)
         noise = self._noise_std(distances, scales)
         zoom, parts = 1.0, 1
         if self._zoom:
@@ -96,10 +101,34 @@ class NoiseReader:
             noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
         return noise
 
+    def _noise_of_scene(self, probes: Patches, distances: Floats, scales: Floats) -> tuple[float, float]:
+        """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""
+        shown = self._calibration.noise_std(distances)
+        noise, usual = (_quantile(shown / scales, probes.owned, share) for share in (0.5, _MOST_POINTS))
+        beyond = _quantile(shown, probes.owned, _MOST_POINTS) >= _AGAIN_ABOVE * self._most
+        return noise, np.inf if beyond else usual
+
+    def _read_scene_again(self, here: Floats, tiling: Tiling, noise: float) -> tuple[float, float]:
+        """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
+        usual = np.inf
+        for zoom in _AGAIN_ZOOMS:
+            some = self._thinned(here, tiling, zoom)
+            probes, _ = self._tile(some).probes(_AGAIN_PROBES)
+            scales = patch_scales(probes.radii, scene=True)
+            again, usual = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
+            noise = max(noise, again)
+            if np.isfinite(usual):
+                break
+        return noise, max(noise, usual)
+
+    def _thinned(self, here: Floats, tiling: Tiling, zoom: float) -> Floats:
+        """Return so few points that patches are as large as before where they are shown zoom times their size."""
+        parts = min(round(1 / zoom**2), len(here) // _AGAIN_POINTS)
+        return here[parted(here, tiling.tiles, max(1, parts))[0]]
+
     def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
         """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
-        parts = min(round(1 / zoom**2), len(here) // _AGAIN_POINTS)
-        some = here[parted(here, tiling.tiles, max(1, parts))[0]]
+        some = self._thinned(here, tiling, zoom)
         probes, _ = self._tile(some).probes(_AGAIN_PROBES)
         scales = patch_scales(probes.radii, scene=False, zoom=zoom)
         return self._noise_std(self._processor.distances(some, probes, scales), scales)

@@ -17,14 +17,14 @@ def one_patch(count: int) -> Patches:
     return Patches(np.array([0]), rows, np.array([count]), np.array([1.0]))
 
 
-def test_a_step_is_whole_up_to_two_noise_stds_and_none_from_three_on() -> None:
-    step = np.array([[0.5, 0, 0], [0, 2.0, 0], [0, 0, 2.5], [3.0, 0, 0], [0, 9.0, 0]])
+def test_a_step_is_whole_up_to_three_noise_stds_and_none_from_four_on() -> None:
+    step = np.array([[0.5, 0, 0], [0, 3.0, 0], [0, 0, 3.5], [4.0, 0, 0], [0, 9.0, 0]])
     shares = np.linalg.norm(restrained(np.zeros((5, 3)), step, 1.0), axis=1) / np.linalg.norm(step, axis=1)
     np.testing.assert_allclose(shares, [1, 1, 0.5, 0, 0])
 
 
 def test_earlier_passes_count_and_a_step_back_is_free() -> None:
-    moved = np.array([[2.0, 0, 0], [2.0, 0, 0]])
+    moved = np.array([[3.0, 0, 0], [3.0, 0, 0]])
     np.testing.assert_allclose(restrained(moved, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 1.0), [[0, 0, 0], [-1, 0, 0]])
 
 
@@ -32,14 +32,15 @@ def test_without_noise_nothing_moves() -> None:
     np.testing.assert_array_equal(restrained(np.zeros((2, 3)), np.array([[1e-6, 0, 0], [0, 0, 0]]), 0.0), 0.0)
 
 
-def test_more_than_the_usual_noise_is_believed_of_a_sheet_only_and_not_without_limit() -> None:
+def test_more_than_the_usual_noise_is_believed_of_a_sheet_alone() -> None:
     rng = np.random.default_rng(0)
     sheet = rng.uniform(-1, 1, (1000, 3)) * [1, 1, 0] + [0, 0, 1] * (0.1 * rng.standard_normal((1000, 1)))
     ball = rng.uniform(-1, 1, (1000, 3))
     patch = one_patch(1000)
     assert reaches(sheet, patch, np.array([0.1]), 0.04) == 0.1
     assert reaches(sheet, patch, np.array([0.1]), 0.02) == pytest.approx(0.06)
-    assert reaches(ball, patch, np.array([0.1]), 0.04) == 0.04
+    assert reaches(ball, patch, np.array([0.045]), 0.04) == 0.04
+    assert reaches(ball, patch, np.array([0.12]), 0.04) == pytest.approx(0.016)
     assert reaches(sheet, patch, np.array([0.01]), 0.04) == 0.04
 
 
