@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from straightpcf.model.filter import load_filter
+from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import reaches, restrained
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import noisy
+from tests.clouds import distance_to_torus, noisy, torus
 
 
 def one_patch(count: int) -> Patches:
@@ -57,3 +57,14 @@ def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
     off = np.linalg.norm((result.xyz[6000:6060] - wire)[:, 1:], axis=1)
     assert np.sqrt(np.mean(off**2)) < 1.5 * np.sqrt(2) * 0.05
     assert result.noise_before == pytest.approx(0.05, rel=0.35)
+
+
+def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
+    cloud = np.concatenate([noisy(torus(9000), 0.07), [[300.0, 0, 0]]])
+    run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=2))
+    for patch in run.patches():
+        cloud[patch.indices] = patch.xyz
+    assert run.readings[0].scene
+    assert run.readings[0].parts > 1
+    assert run.result(0.0).noise_before == pytest.approx(0.07, rel=0.4)
+    assert np.sqrt(np.mean(distance_to_torus(cloud[:-1]) ** 2)) < 0.4 * 0.07
