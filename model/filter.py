@@ -131,7 +131,7 @@ class Filter:
         """Put a network between the stages.
 
         even: between passes, points are spread along the surface (`spread`). zoom: passes show an object in the size of
-        its noise, and in parts where that fills the patches (`NoiseReader`).
+        its noise, and in parts where that fills the patches (`NoiseReader`); a scene's points go no farther than it.
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """

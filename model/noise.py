@@ -49,7 +49,7 @@ class NoiseReader:
     def __init__(
         self, processor: Processor, calibration: Calibration, tile: Callable[[Floats], Tiling], *, zoom: bool
     ) -> None:
-        """tile: cuts some of the points into patches. zoom: whether objects are shown in the size of their noise."""
+        """tile: cuts some of the points into patches. zoom: whether the noise changes what a pass does."""
         self._processor, self._calibration, self._tile, self._zoom = processor, calibration, tile, zoom
         self._most = float(calibration.noise[-1])
 
@@ -64,11 +64,7 @@ class NoiseReader:
         distances = self._processor.distances(here, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         if scene:
-            noise, usual = self._noise_of_scene(probes, distances, scales)
-            parts = 1
-            if first is None and np.isinf(usual):
-                noise, usual = self._read_scene_again(here, tiling, noise)
-                parts = parts_of(noise, probes.radii, len(here))
+            noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
             return Reading(distance, noise, scene, parts=parts, probed=known if parts == 1 else {}, usual=usual)
         noise = self._noise_std(distances, scales)
         zoom, parts = 1.0, 1
@@ -100,6 +96,18 @@ class NoiseReader:
                 break
             noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
         return noise
+
+    def _read_scene(
+        self, here: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, *, first: bool
+    ) -> tuple[float, float, int]:
+        """Return the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
+        noise, usual = self._noise_of_scene(probes, distances, scales)
+        if not self._zoom:
+            return noise, np.inf, 1
+        if np.isfinite(usual) or not first:
+            return noise, usual, 1
+        noise, usual = self._read_scene_again(here, tiling, noise)
+        return noise, usual, parts_of(noise, probes.radii, len(here))
 
     def _noise_of_scene(self, probes: Patches, distances: Floats, scales: Floats) -> tuple[float, float]:
         """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""
