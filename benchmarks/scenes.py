@@ -277,6 +277,8 @@ def main(arguments: list[str] | None = None) -> None:
         for part, points, before, after in _rows(scan, keep, result.xyz):
             print(f"  {part:8s} {points:7d} points  rms distance {before:6.2f} -> {after:6.2f} mm")
             rows.append({"scanner": name, "part": part, "points": points, "before": before, "after": after})
+        own = " -> ".join(f"{_rms(np.linalg.norm(xyz - scan.clean[keep], axis=1)):.2f}" for xyz in (noisy, result.xyz))
+        print(f"  from where each point would be without noise: rms {own} mm")
         moved = 1000 * np.percentile(np.linalg.norm(result.xyz - noisy, axis=1), (50, 90, 99, 100))
         print("  moved, mm: 50 % {:.1f}  90 % {:.1f}  99 % {:.1f}  most {:.1f}".format(*moved))
     if options.json:

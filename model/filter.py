@@ -23,7 +23,7 @@ from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
-from straightpcf.model.restraint import reaches, restrained
+from straightpcf.model.restraint import across, reaches, restrained
 from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
@@ -131,7 +131,8 @@ class Filter:
         """Put a network between the stages.
 
         even: between passes, points are spread along the surface (`spread`). zoom: passes show an object in the size of
-        its noise, and in parts where that fills the patches (`NoiseReader`); a scene's points go no farther than it.
+        its noise, and in parts where that fills the patches (`NoiseReader`); a scene's points go no farther than it
+        and not along surfaces (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """
@@ -284,13 +285,13 @@ class Run:
         for cut in self._cuts(here, tiling, shown.parts):
             scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
             probed, believed = shown.probed, None
-            if shown.scene:
+            if shown.scene and self.filter.zoom:
                 probed, believed = self._believed(here, cut, scales)
             for patch, displacement in self.filter.processor.displacements(here, cut, scales, probed):
                 owned = cut.owned_points(patch)
                 step = displacement / scales[patch]
                 if believed is not None:
-                    step = restrained(self.moved[owned], step, believed[patch])
+                    step = across(restrained(self.moved[owned], step, believed[patch]), here[cut.index[patch]])
                 self.moved[owned] += step
                 settled += len(owned)
                 copies = self.points.copies(owned)

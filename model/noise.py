@@ -102,9 +102,7 @@ class NoiseReader:
     ) -> tuple[float, float, int]:
         """Return the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
         noise, usual = self._noise_of_scene(probes, distances, scales)
-        if not self._zoom:
-            return noise, np.inf, 1
-        if np.isfinite(usual) or not first:
+        if np.isfinite(usual) or not (first and self._zoom):
             return noise, usual, 1
         noise, usual = self._read_scene_again(here, tiling, noise)
         return noise, usual, parts_of(noise, probes.radii, len(here))

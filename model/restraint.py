@@ -1,19 +1,26 @@
-"""How far the points of a scene may go: what would have to move much farther than its noise reaches is no noise."""
+"""How far the points of a scene may go, and where to: no farther than its noise reaches, and not along a surface."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from straightpcf.model.patches import Patches
 
-__all__ = ["reaches", "restrained"]
+__all__ = ["across", "reaches", "restrained"]
 
 # In noise stds: moves up to the first are made whole, from the last on none is (docs/training.md, "Scenes").
 _WHOLE, _NONE = 3.0, 4.0
 _SHEET = 1.3  # a patch is one sheet where its points lie so many of its noise stds from their plane, or nearer
 _MOST = 3.0  # of the usual noise, what is believed of any sheet
 _DOUBTFUL = 1.2  # of the usual noise; of what is no sheet and reads more, less is believed the more it reads
+
+# Of a point's nearest neighbours, the std across their plane beside the lesser one along it: up to the first nothing
+# moves along the plane, from the last on all that was asked does. As much as is asked moves along a line, of which the
+# stds along the plane are as 1 : 10 or less; from 1 : 5 on it is none.
+_AROUND = 24
+_FLAT, _ROUND, _LINE = 0.15, 0.3, 0.1
 
 
 def reaches(
@@ -40,6 +47,24 @@ def restrained(
     distance = np.linalg.norm(moved + step, axis=1)
     weight = np.clip((_NONE - distance / max(noise_std, 1e-300)) / (_NONE - _WHOLE), 0.0, 1.0)
     out: npt.NDArray[np.float64] = step * weight[:, None]
+    return out
+
+
+def across(step: npt.NDArray[np.float64], around: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return a step (n, 3) without what goes along the surface, where there is one.
+
+    around: (P, 3), a patch, of which the first n points make the step. An object's points are spread evenly (`spread`);
+    a scene's lie as the scanner's beams fell, and to draw them together widens gaps and tears scan lines.
+    """
+    count = min(_AROUND, len(around))
+    _, nearest = cKDTree(around).query(around[: len(step)], k=np.arange(1, count + 1))
+    local = around[nearest] - around[nearest].mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
+    least, less, most = np.sqrt(np.maximum(variances, 1e-300)).T
+    plane = np.clip((_ROUND - least / less) / (_ROUND - _FLAT), 0, 1) * np.clip(less / most / _LINE - 1, 0, 1)
+    normals = axes[:, :, 0]
+    along = step - (step * normals).sum(axis=1, keepdims=True) * normals
+    out: npt.NDArray[np.float64] = step - along * plane[:, None]
     return out
 
 

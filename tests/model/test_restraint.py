@@ -7,7 +7,7 @@ import pytest
 
 from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import reaches, restrained
+from straightpcf.model.restraint import across, reaches, restrained
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, torus
 
@@ -42,6 +42,28 @@ def test_more_than_the_usual_noise_is_believed_of_a_sheet_alone() -> None:
     assert reaches(ball, patch, np.array([0.045]), 0.04) == 0.04
     assert reaches(ball, patch, np.array([0.12]), 0.04) == pytest.approx(0.016)
     assert reaches(sheet, patch, np.array([0.01]), 0.04) == 0.04
+
+
+def test_nothing_goes_along_a_surface_and_all_across_it() -> None:
+    rng = np.random.default_rng(0)
+    sheet = rng.uniform(-1, 1, (500, 3)) * [1, 1, 0] + [0, 0, 1] * (0.01 * rng.standard_normal((500, 1)))
+    step = rng.normal(0, 0.01, (200, 3))
+    left = across(step, sheet)
+    np.testing.assert_allclose(left[:, 2], step[:, 2], atol=0.3 * 0.01)
+    assert np.abs(left[:, :2]).max() < 0.3 * np.abs(step[:, :2]).max()
+
+
+def test_where_there_is_no_surface_a_step_stays_as_it_is() -> None:
+    rng = np.random.default_rng(0)
+    step = rng.normal(0, 0.01, (200, 3))
+    inside = np.linalg.norm(across(step, rng.standard_normal((1000, 3))), axis=1) / np.linalg.norm(step, axis=1)
+    assert np.median(inside) == 1.0
+    np.testing.assert_array_equal(across(step, np.zeros((300, 3))), step)
+    assert across(step[:0], sheet_of(300)).shape == (0, 3)
+
+
+def sheet_of(count: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (count, 3)) * [1, 1, 0]
 
 
 def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
