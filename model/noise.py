@@ -56,10 +56,11 @@ class NoiseReader:
     def read(self, here: Floats, tiling: Tiling, first: Reading | None) -> Reading:
         """Read the noise of a cloud; first: the reading before the first pass, None where this is it.
 
-        Where the pass shows the whole cloud in another size than that of the reading, d is read in that size, too.
+        What is a scene is said once: patches shrink as the noise goes. Where the pass shows the whole cloud in another
+        size than that of the reading, d is read in that size, too.
         """
         probes, numbers = tiling.probes()
-        scene = is_scene(_quantile(probes.radii, probes.owned, 0.5))
+        scene = is_scene(_quantile(probes.radii, probes.owned, 0.5)) if first is None else first.scene
         scales = patch_scales(probes.radii, scene=scene)
         distances = self._processor.distances(here, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))

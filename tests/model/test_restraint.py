@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import Run, load_filter
+from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import across, reaches, restrained
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, torus
 
@@ -90,3 +92,13 @@ def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
     assert run.readings[0].parts > 1
     assert run.result(0.0).noise_before == pytest.approx(0.07, rel=0.4)
     assert np.sqrt(np.mean(distance_to_torus(cloud[:-1]) ** 2)) < 0.4 * 0.07
+
+
+def test_what_was_an_object_before_the_first_pass_stays_one() -> None:
+    cloud = noisy(torus(5000), 0.01)
+    run = Run(load_filter(device="cpu"), cloud, DenoiseOptions())
+    wide = np.concatenate([cloud, [[300.0, 0, 0]]])
+    wide /= 300.0
+    tiling = Tiling(wide, split(wide, 10_000), coverage=1.0, seed=0)
+    assert run.reader.read(wide, tiling, None).scene
+    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False)).scene
