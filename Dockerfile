@@ -25,6 +25,14 @@ RUN /venv/bin/pip install --no-cache-dir ".[service,grpc,las]" \
     && /venv/bin/python -c "from pathlib import Path; from straightpcf.model.kernels import cpu; cpu.build_all(Path(cpu.__file__).with_name('lib'))"
 
 FROM python:${PYTHON}-slim
+ARG TORCH=cpu
+# Triton compiles a launcher for each of its kernels where they run.
+# hadolint ignore=DL3008
+RUN if [ "$TORCH" != cpu ]; then \
+        apt-get update \
+        && apt-get install -y --no-install-recommends gcc libc6-dev \
+        && rm -rf /var/lib/apt/lists/*; \
+    fi
 LABEL org.opencontainers.image.title="straightpcf" \
       org.opencontainers.image.description="Point-cloud denoising as a service" \
       org.opencontainers.image.licenses="MIT"
@@ -35,6 +43,7 @@ USER 10001
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     STRAIGHTPCF_DATA_DIR=/data \
+    TRITON_CACHE_DIR=/data/.triton \
     STRAIGHTPCF_GRPC_PORT=50051
 VOLUME /data
 EXPOSE 8000 50051

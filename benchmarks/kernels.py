@@ -1,58 +1,71 @@
-"""Time the compiled loops against their plain torch twins on one thread: `python -m benchmarks.kernels`."""
+"""Time the compiled loops against their plain torch twins: `python -m benchmarks.kernels [--device cuda]`.
+
+On a CPU one thread and 4 patches, on a device the batch of 32 that the filter gives it.
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 from functools import partial
 
 import torch
 
+from benchmarks.speed import finish
 from straightpcf.model import ops
 from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.kernels import cpu
 from straightpcf.model.nets.straightpcf import VelocityModule
 
-POINTS, NEIGHBOURS, PATCHES = 1000, 32, 4
-
-
-def milliseconds(function: Callable[..., object], *arguments: object, repeats: int = 7) -> float:
-    """Return the median time of a call, per patch."""
-    function(*arguments)
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        function(*arguments)
-        times.append(time.perf_counter() - began)
-    return sorted(times)[repeats // 2] * 1e3 / PATCHES
+POINTS, NEIGHBOURS = 1000, 32
 
 
 def main() -> None:
     """Print a row per operation."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels")
+    parser.add_argument("--device", default="cpu", help='"cpu" (the default) or "cuda"')
+    device = parser.parse_args().device
+    patches = 4 if device == "cpu" else 32
+
+    def milliseconds(function: Callable[..., object], *arguments: object, repeats: int = 7) -> float:
+        """Return the median time of a call, per patch."""
+        function(*arguments)
+        times = []
+        for _ in range(repeats):
+            finish(device)
+            began = time.perf_counter()
+            function(*arguments)
+            finish(device)
+            times.append(time.perf_counter() - began)
+        return sorted(times)[repeats // 2] * 1e3 / patches
+
     torch.set_num_threads(1)
     keep_large_buffers()
-    generator = torch.Generator().manual_seed(0)
-    print(f"instruction set {cpu.instruction_set()}, 1 thread, {POINTS} points, k = {NEIGHBOURS}, ms per patch")
+    torch.set_default_device(device)
+    generator = torch.Generator(device).manual_seed(0)
+    where = torch.cuda.get_device_name(device) if device != "cpu" else f"{cpu.instruction_set()}, 1 thread"
+    print(f"{where}, {POINTS} points, k = {NEIGHBOURS}, ms per patch")
     print(f"{'':24} {'kernel':>8} {'torch':>8} {'GFLOP/s':>8}")
     for dims in (3, 32, 64):
-        x = torch.randn(PATCHES, POINTS, dims, generator=generator)
+        x = torch.randn(patches, POINTS, dims, generator=generator)
         ours, torchs = milliseconds(ops.knn, x, NEIGHBOURS), milliseconds(ops.knn_torch, x, NEIGHBOURS, POINTS)
         print(f"knn, {dims:2} dimensions {ours:13.2f} {torchs:8.2f}")
-    index = ops.knn(torch.randn(PATCHES, POINTS, 3, generator=generator), NEIGHBOURS)
+    index = ops.knn(torch.randn(patches, POINTS, 3, generator=generator), NEIGHBOURS)
     for width in (32, 64, 256):
-        a, b = (torch.randn(PATCHES, POINTS, width, generator=generator, requires_grad=True) for _ in range(2))
+        a, b = (torch.randn(patches, POINTS, width, generator=generator, requires_grad=True) for _ in range(2))
         weight = torch.randn(width, width, generator=generator).div_(width**0.5).requires_grad_()
         with torch.no_grad():
             ours = milliseconds(ops.edge_max, a, b, index, weight)
             torchs = milliseconds(ops.edge_max_torch, a, b, index, weight, repeats=3)
         rate = 2 * POINTS * NEIGHBOURS * width**2 / ours / 1e6
         print(f"edge_max, {width:3} channels {ours:9.2f} {torchs:8.2f} {rate:8.0f}")
-        out, grad = ops.edge_max(a, b, index, weight), torch.randn(PATCHES, POINTS, width, generator=generator)
+        out, grad = ops.edge_max(a, b, index, weight), torch.randn(patches, POINTS, width, generator=generator)
         ours = milliseconds(partial(torch.autograd.grad, retain_graph=True), out, (a, b, weight), grad)
         print(f"  its gradient {ours:18.2f}")
     module = VelocityModule().eval()
     with torch.inference_mode():
-        x = torch.randn(PATCHES, POINTS, 3, generator=generator) * 0.2
+        x = torch.randn(patches, POINTS, 3, generator=generator) * 0.2
         print(f"VelocityModule {milliseconds(module, x):18.2f}")
 
 

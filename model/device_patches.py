@@ -11,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.kernels import cuda
+from straightpcf.model.ops import squared_distances
 from straightpcf.model.patches import PATCH_SIZE, Patches
 
-__all__ = ["cut_patches_on"]
+__all__ = ["cut_patches_on", "farthest_torch"]
 
-_DISTANCES = 2**27  # held at once, 512 MiB
+_DISTANCES = 2**26  # held at once: 256 MiB, and as much again while they are computed
 
 
 def cut_patches_on(
@@ -49,9 +51,16 @@ def cut_patches_on(
 
 
 def _farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
-    """Sample farthest points of (N, 3), beginning with row `first`; the loop never waits for the device."""
+    """Sample farthest points of (N, 3) float32, beginning with row `first`: (wanted,)."""
     if wanted >= len(points):
         return torch.arange(len(points), device=points.device)
+    if points.is_cuda and len(points) <= cuda.MOST_FARTHEST and cuda.load():
+        return cuda.farthest(points, wanted, first)
+    return farthest_torch(points, wanted, first)
+
+
+def farthest_torch(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
+    """Do what `kernels.cuda.farthest` does for any number of points; the loop never waits for the device."""
     seeds = torch.empty(wanted, dtype=torch.int64, device=points.device)
     nearest = torch.full((len(points),), torch.inf, device=points.device)
     last = torch.tensor([first], device=points.device)
@@ -68,9 +77,8 @@ def _nearest(points: torch.Tensor, seeds: torch.Tensor, size: int) -> tuple[torc
     found = []
     for some in torch.split(seeds, max(1, _DISTANCES // len(points))):
         # Differences, not products: these keep no digit of a small patch far from the origin.
-        distance = torch.cdist(points[some], points, compute_mode="donot_use_mm_for_euclid_dist")
-        found.append(distance.topk(size, dim=1, largest=False))
-    return torch.cat([f.values for f in found]), torch.cat([f.indices for f in found])
+        found.append(squared_distances(points[some], points).topk(size, dim=1, largest=False))
+    return torch.cat([f.values.sqrt() for f in found]), torch.cat([f.indices for f in found])
 
 
 def _owners(distance: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:

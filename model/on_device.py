@@ -11,6 +11,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -37,9 +38,12 @@ _IN_FLIGHT = 2  # batches of which the results have not been read
 
 def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], object], torch.Tensor]:
     """Capture one run of a computation, which has run before, as a CUDA graph."""
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        out = run()
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
+    try:
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            out = run()
+    finally:
+        torch.cuda.set_stream(stream)  # a capture that fails leaves its own current
     return graph.replay, out
 
 
@@ -64,10 +68,12 @@ class Graphs:
         key = (len(x), rows, distance is not None)
         given = [x, owned] if distance is None else [x, owned, distance]
         if key not in self._graphs:
-            worth = x.shape[1] == PATCH_SIZE and len(self._graphs) < _MOST_GRAPHS and not self._broken
+            worth = x.shape[1] == PATCH_SIZE and not self._broken
             if not worth or key not in self._seen:
                 self._seen.add(key)
                 return self._forward(x, owned, distance, rows)
+            if len(self._graphs) == _MOST_GRAPHS:
+                del self._graphs[next(iter(self._graphs))]
             inputs = [tensor.clone() for tensor in given]
             again = partial(self._forward, inputs[0], inputs[1], None if distance is None else inputs[2], rows)
             try:
@@ -78,7 +84,7 @@ class Graphs:
                 warnings.warn(f"the network is not captured as a CUDA graph, it runs without: {exc}", stacklevel=2)
                 self._broken = True
                 return self._forward(x, owned, distance, rows)
-        inputs, replay, out = self._graphs[key]
+        inputs, replay, out = self._graphs[key] = self._graphs.pop(key)  # the one used last is given up last
         for static, fresh in zip(inputs, given, strict=True):
             static.copy_(fresh)
         replay()
@@ -112,14 +118,14 @@ class OnDevice:
 
         Raises TooLarge where it has no memory for one patch.
         """
-        points = torch.from_numpy(here).to(self.device)
+        points, held = torch.from_numpy(here).to(self.device), _Held.of(cut, scales, probed, self.device)
         waiting: deque[tuple[range, _Result]] = deque()
         first = 0
         while first < len(cut.seeds):
             chosen = range(first, min(first + self.batch, len(cut.seeds)))
             try:
                 with self._current():
-                    moves = self._launch(points, cut, scales, probed, chosen)
+                    moves = self._launch(points, cut, held, chosen)
                     waiting.append((chosen, _Result(moves[: len(chosen)])))
             except torch.OutOfMemoryError as exc:
                 if self.batch == 1:
@@ -137,10 +143,10 @@ class OnDevice:
     @torch.inference_mode()
     def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
-        points = torch.from_numpy(here).to(self.device)
-        batches = (np.arange(len(cut.seeds))[i : i + self.batch] for i in range(0, len(cut.seeds), self.batch))
+        points, held = torch.from_numpy(here).to(self.device), _Held.of(cut, scales, {}, self.device)
+        batches = (slice(i, i + self.batch) for i in range(0, len(cut.seeds), self.batch))
         with self._current():
-            found = [self._distances(cut_out(points, cut, scales, batch)) for batch in batches]
+            found = [self._distances(held.cut_out(points, batch)) for batch in batches]
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
@@ -151,10 +157,10 @@ class OnDevice:
         nearest = min(AROUND, PATCH_SIZE - 1, len(here) - 1)
         around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
         for cut in tiling.cuts():
+            held = _Held.of(cut, np.ones(len(cut.seeds)), {}, self.device)
             for first in range(0, len(cut.seeds), self.batch):
-                batch = np.arange(first, min(first + self.batch, len(cut.seeds)))
-                x = cut_out(points, cut, np.ones(len(cut.seeds)), batch)
-                index, owned = (torch.from_numpy(part[batch]).to(self.device) for part in (cut.index, cut.owned))
+                batch = slice(first, first + self.batch)
+                x, index, owned = held.cut_out(points, batch), held.index[batch], held.owned[batch]
                 rows = max(1, int(cut.owned[batch].max()))
                 patch, row = (torch.arange(rows, device=self.device) < owned[:, None]).nonzero(as_tuple=True)
                 with self._current():
@@ -170,17 +176,40 @@ class OnDevice:
         return torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
 
     @torch.inference_mode()
-    def _launch(
-        self, points: torch.Tensor, cut: Patches, scales: Floats, probed: Mapping[int, float], chosen: range
-    ) -> torch.Tensor:
+    def _launch(self, points: torch.Tensor, cut: Patches, held: _Held, chosen: range) -> torch.Tensor:
         # A last batch that is not full is filled up with its last patch: one shape more would be one graph more.
         full = self.batch if len(cut.seeds) > self.batch else len(chosen)
-        batch = np.minimum(np.arange(chosen.start, chosen.start + full), chosen.stop - 1)
-        known = [probed[i] for i in batch.tolist() if i in probed]
-        distance = torch.tensor(known, device=self.device)[:, None] if len(known) == len(batch) else None
-        owned = torch.from_numpy(cut.owned[batch]).to(self.device)
-        rows = max(1, int(cut.owned[batch].max()))
-        return self._graphs(cut_out(points, cut, scales, batch), owned, distance, rows)
+        batch = torch.arange(chosen.start, chosen.start + full, device=self.device).clamp(max=chosen.stop - 1)
+        some = slice(chosen.start, chosen.stop)
+        distance = held.probed[batch] if held.known[some].all() else None
+        rows = max(1, int(cut.owned[some].max()))
+        return self._graphs(held.cut_out(points, batch), held.owned[batch], distance, rows)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A cut and what goes with it, on the device: sent up once, for every batch of it.
+
+    known: (M,), of which patches `probed`, (M, 1), holds what the DistanceModule said, on the host; index: (M, P),
+    seeds, owned: (M,), as in Patches; scales: (M,).
+    """
+
+    known: npt.NDArray[np.bool_]
+    index: torch.Tensor
+    seeds: torch.Tensor
+    owned: torch.Tensor
+    scales: torch.Tensor
+    probed: torch.Tensor
+
+    @classmethod
+    def of(cls, cut: Patches, scales: Floats, probed: Mapping[int, float], device: torch.device) -> _Held:
+        said = np.array([[probed.get(patch, np.nan)] for patch in range(len(cut.seeds))], dtype=np.float32)
+        parts = (torch.from_numpy(part).to(device) for part in (cut.index, cut.seeds, cut.owned, scales, said))
+        return cls(~np.isnan(said[:, 0]), *parts)
+
+    def cut_out(self, points: torch.Tensor, batch: torch.Tensor | slice) -> torch.Tensor:
+        """Cut some patches out of the points."""
+        return cut_out(points, self.index[batch], self.seeds[batch], self.scales[batch])
 
 
 class _Result:

@@ -37,7 +37,7 @@ class OnHost:
             known = probed.get(patch)
             distance = None if known is None else torch.tensor([[known]])
             owned = int(cut.owned[patch])
-            x = cut_out(points, cut, scales, np.array([patch]))
+            x = _cut_out(points, cut, scales, patch)
             return self._forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned].double().numpy()
 
         yield from enumerate(self._map(move, range(len(cut.seeds))))
@@ -47,7 +47,7 @@ class OnHost:
         points = torch.from_numpy(here)
 
         def read(patch: int) -> float:
-            return float(self._distances(cut_out(points, cut, scales, np.array([patch]))))
+            return float(self._distances(_cut_out(points, cut, scales, patch)))
 
         return np.array(list(self._map(read, range(len(cut.seeds)))))
 
@@ -71,6 +71,11 @@ class OnHost:
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def _cut_out(points: torch.Tensor, cut: Patches, scales: Floats, patch: int) -> torch.Tensor:
+    some = slice(patch, patch + 1)
+    return cut_out(points, *(torch.from_numpy(part[some]) for part in (cut.index, cut.seeds, scales)))
 
 
 def _one_thread() -> None:

@@ -6,7 +6,7 @@ import torch
 
 from straightpcf.model.kernels import cpu, cuda
 
-__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch"]
+__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "squared_distances"]
 
 
 def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
@@ -17,7 +17,7 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
     the farthest.
     """
     rows = x.shape[1] if rows is None else rows
-    if x.is_cuda and cuda.load():
+    if x.is_cuda and x.shape[1] <= cuda.MOST_POINTS and cuda.load():
         return cuda.knn(x.detach(), k, rows)
     library = cpu.load() if x.device.type == "cpu" and x.dtype == torch.float32 and k <= 64 else None
     return knn_torch(x, k, rows) if library is None else cpu.knn(library, x, k, rows)
@@ -26,13 +26,27 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
 def knn_torch(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
     """Do what `knn` does with a full distance matrix and `torch.topk`."""
     x = x.detach()
-    direct = x.shape[2] < 8  # exact differences where they are cheap
-    mode = "donot_use_mm_for_euclid_dist" if direct else "use_mm_for_euclid_dist"
-    distance = torch.cdist(x[:, :rows], x, compute_mode=mode)
+    if x.shape[2] < 8:  # exact differences where they are cheap
+        distance = squared_distances(x[:, :rows], x)
+    else:
+        distance = torch.cdist(x[:, :rows], x, compute_mode="use_mm_for_euclid_dist")
     distance.diagonal(dim1=1, dim2=2).fill_(torch.inf)
     found = min(k, x.shape[1] - 1)
     index = distance.topk(found, dim=2, largest=False).indices
     return index if found == k else torch.cat([index, index[:, :, -1:].expand(-1, -1, k - found)], dim=2)
+
+
+def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return |a_i - b_j|^2, (..., A, B), of points (..., A, C) and (..., B, C), as a sum of C squared differences.
+
+    `torch.cdist` without products gives each of them a block of threads of its own on a GPU.
+    """
+    first, *others = range(a.shape[-1])
+    distance = (a[..., :, None, first] - b[..., None, :, first]).square_()
+    for axis in others:
+        apart = a[..., :, None, axis] - b[..., None, :, axis]
+        distance.addcmul_(apart, apart)
+    return distance
 
 
 def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import fpsample
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -102,6 +101,8 @@ def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDAr
         return np.arange(len(xyz), dtype=np.int64)
     if wanted == 1:
         return np.array([first], dtype=np.int64)
+    import fpsample  # a device samples by itself
+
     height = min(_TREE_HEIGHT, len(xyz).bit_length() - 1)
     seeds = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), wanted, height, first)
     return np.asarray(seeds, dtype=np.int64)

@@ -37,10 +37,10 @@ class Processor(Protocol):
         """Return what `model.spread.spread` does; tiling: of the pass before."""
 
 
-def cut_out(points: torch.Tensor, cut: Patches, scales: Floats, batch: npt.NDArray[np.int64]) -> torch.Tensor:
-    """Cut some patches out of the points, centred on their seeds: (B, P, 3) float32, on the points' device."""
-    index, seeds, scale = (
-        torch.from_numpy(part[batch]).to(points.device) for part in (cut.index, cut.seeds, scales)
-    )  # fmt: skip
+def cut_out(points: torch.Tensor, index: torch.Tensor, seeds: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
+    """Cut patches out of the points (N, 3), centred on their seeds: (B, P, 3) float32.
+
+    index: (B, P) rows; seeds: (B,) rows; scales: (B,) float64; all where the points are.
+    """
     local = points[index.long()] - points[seeds][:, None]
-    return (local * scale[:, None, None]).float()
+    return (local * scales[:, None, None]).float()

@@ -19,7 +19,7 @@ _STEP = 0.2
 _PUSHING = 8  # neighbours
 # The length of the mean direction to a point's neighbours: 0 where they are all around, 0.64 on a straight border.
 _BORDER, _INSIDE = 0.5, 0.3
-_CHUNKS = {"cpu": 1 << 13, "cuda": 1 << 20}  # points at once: what the cache holds, what a device is filled by
+_CHUNKS = {"cpu": 1 << 13, "cuda": 1 << 15}  # points at once: what the cache holds, what a batched product takes
 _TINY = torch.finfo(torch.float64).tiny
 
 

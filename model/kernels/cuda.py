@@ -1,7 +1,7 @@
-"""The same loops for CUDA, in Triton: neighbour search, and the EdgeConv maximum without the edge tensor.
+"""The same loops for CUDA, in Triton: neighbour search, the EdgeConv maximum without the edge tensor, farthest points.
 
-Written and tested through Triton's interpreter; not yet run on a GPU (docs/kernels.md). Where Triton is missing, or the
-first launch fails, `load()` returns None and the torch twins do the work.
+Tested through Triton's interpreter and compiled for Hopper; not yet run on a GPU (docs/kernels.md). Where Triton is
+missing, or the kernels do not do what their torch twins do, `load()` returns False and the twins do the work.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import os
 import warnings
-from typing import Any
 
 import torch
 
@@ -19,22 +18,23 @@ try:
 except ImportError:  # a CPU build of torch comes without it
     triton = None
 
-__all__ = ["edge_max", "knn", "load"]
+__all__ = ["MOST_FARTHEST", "MOST_POINTS", "edge_max", "farthest", "knn", "load"]
 
-_ROWS, _CHANNELS = 16, 16  # of a tile of the neighbour search; a tile sees every point of the patch
-_MAX_POINTS = 2048
-_POINTS = 4  # whose 32 edges each make a tile of 128 rows
+MOST_POINTS = 2048  # of a patch; its indices fill the low bits of a key, and a warp's registers hold two rows of keys
+_ROWS = 2
+_DIRECT = 8  # with fewer channels distances are differences, exact; with more, products
+_EDGE_POINTS = 4  # whose 32 edges each make a tile of 128 rows
+MOST_FARTHEST = 1 << 17  # points; of more, one program is slower than launches over the whole device
+_FARTHEST_BLOCK = 4096
 
 
 @functools.cache
 def load() -> bool:
-    """Tell whether the kernels run on this machine's GPU."""
+    """Tell whether the kernels run on this machine's GPU, each once in the shapes that the filter has."""
     if triton is None or os.environ.get("STRAIGHTPCF_NO_KERNELS"):
         return False
     try:
-        x = torch.zeros(1, 64, 32, device="cuda")
-        edge_max(x, x, knn(x, 32, 64), torch.zeros(32, 32, device="cuda"))
-        torch.cuda.synchronize()
+        _prove(torch.device("cuda"))
     except Exception as exc:  # the compiler's own errors have no common base
         warnings.warn(f"the Triton kernels do not run here, plain torch does: {exc}", stacklevel=2)
         return False
@@ -42,16 +42,19 @@ def load() -> bool:
 
 
 def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
-    """Do what `ops.knn` does; returns int32 indices."""
+    """Do what `ops.knn` does for at most MOST_POINTS points a patch; returns int32 indices.
+
+    Squared distances are compared to 12 bits after the leading one or more, equal ones by index.
+    """
     batch, points, channels = x.shape
-    if points > _MAX_POINTS:
-        raise ValueError(f"a patch of {points} points; the kernel takes {_MAX_POINTS}")
-    x = x.contiguous()
+    if points > MOST_POINTS:
+        raise ValueError(f"a patch of {points} points; the kernel takes {MOST_POINTS}")
     out = torch.empty(batch, rows, k, dtype=torch.int32, device=x.device)
-    _knn[batch, triton.cdiv(rows, _ROWS)](
-        x, out, points, rows, channels,
-        direct=channels < _CHANNELS, K=k, ROWS=_ROWS, CHANNELS=_CHANNELS, POINTS=triton.next_power_of_2(points),
-        num_warps=8,
+    direct = channels < _DIRECT
+    given = x.contiguous() if direct else torch.bmm(x[:, :rows], x.mT)
+    _nearest[batch, triton.cdiv(rows, _ROWS)](
+        given, x.square().sum(dim=2), out, points, rows,
+        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=triton.next_power_of_2(points), num_warps=1,
     )  # fmt: skip
     return out
 
@@ -62,61 +65,87 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     out_channels, k = weight.shape[0], index.shape[2]
     out = torch.empty(batch, rows, out_channels, dtype=torch.float32, device=a.device)
     width = min(128, triton.next_power_of_2(out_channels))
-    _edge_max[batch, triton.cdiv(rows, _POINTS), triton.cdiv(out_channels, width)](
+    _edge_max[batch, triton.cdiv(rows, _EDGE_POINTS), triton.cdiv(out_channels, width)](
         a.to(torch.float16).contiguous(), b.to(torch.float16).contiguous(), index.contiguous(),
         weight.to(torch.float16).contiguous(), out, b.shape[1], rows, out_channels,
-        CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_POINTS, WIDTH=width, num_warps=8,
+        CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_EDGE_POINTS, WIDTH=width, num_warps=8,
     )  # fmt: skip
     return out
 
 
+def farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
+    """Sample `wanted` farthest points of (N, 3) float32, beginning with row `first`: (wanted,) int64, one launch."""
+    seeds = torch.empty(wanted, dtype=torch.int64, device=points.device)
+    apart = torch.full((len(points),), torch.inf, device=points.device)
+    _farthest[1,](points.T.contiguous(), apart, seeds, len(points), wanted, first, BLOCK=_FARTHEST_BLOCK, num_warps=16)
+    return seeds
+
+
+def _prove(device: torch.device) -> None:
+    """Raise unless each kernel does what its torch twin does, in the shapes of a patch of the shipped network."""
+    from straightpcf.model import device_patches, ops  # they import this module
+
+    generator = torch.Generator(device).manual_seed(0)
+    for channels, k in ((3, 16), (3, 32), (16, 32), (32, 32), (64, 32)):
+        x = torch.randn(1, 1000, channels, device=device, generator=generator)
+        agree = knn(x, k, 1000).long().sort().values == ops.knn_torch(x, k, 1000).sort().values
+        if agree.float().mean() < 0.99:
+            raise RuntimeError(f"other nearest neighbours among {channels} channels")
+    index = knn(x, 32, 1000)
+    for width in (16, 32, 64, 128, 256):
+        a, b = torch.randn(2, 1, 1000, width, device=device, generator=generator)
+        weight = torch.randn(width, width, device=device, generator=generator)
+        expected = ops.edge_max_torch(a, b, index, weight)
+        if not (edge_max(a, b, index, weight) - expected).norm() < 1e-2 * expected.norm():
+            raise RuntimeError(f"another maximum over edges of {width} channels")
+    cloud = torch.randn(5000, 3, device=device, generator=generator)
+    if not torch.equal(farthest(cloud, 8, 1), device_patches.farthest_torch(cloud, 8, 1)):
+        raise RuntimeError("other farthest points")
+
+
 if triton is not None:
+    # Their parameters bear no annotations but tl.constexpr: the compiler would evaluate them.
 
     @triton.jit  # type: ignore[untyped-decorator]
-    def _knn(
-        x: Any, out: Any, points: Any, rows: Any, channels: Any,
-        direct: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, CHANNELS: tl.constexpr, POINTS: tl.constexpr,
-    ) -> None:  # fmt: skip
-        """Select the K nearest of all points for ROWS points of one patch: distances once, then K minima."""
+    def _nearest(  # type: ignore[no-untyped-def]
+        x, squares, out, points, rows,
+        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr,
+    ):  # fmt: skip
+        """Select the K nearest of all points for ROWS points of one patch, by K minima inside one warp.
+
+        x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points. A distance gives
+        its low bits to the point's index: one comparison finds both.
+        """
         patch = tl.program_id(0).to(tl.int64)
         i = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
         j = tl.arange(0, POINTS)
-        base = x + patch * points * channels
-        distance = tl.zeros([ROWS, POINTS], tl.float32)
-        if direct:  # exact differences where they are cheap
-            for c in range(channels):
-                own = tl.load(base + i * channels + c, mask=i < points, other=0.0)
-                other = tl.load(base + j * channels + c, mask=j < points, other=0.0)
-                difference = own[:, None] - other[None, :]
-                distance += difference * difference
-        else:  # |x_j|^2 - 2 x_i x_j orders as the distance does
-            for first in range(0, channels, CHANNELS):
-                c = first + tl.arange(0, CHANNELS)
-                own = tl.load(
-                    base + i[:, None] * channels + c[None, :],
-                    mask=(i < points)[:, None] & (c < channels)[None, :],
-                    other=0.0,
-                )
-                other = tl.load(
-                    base + j[None, :] * channels + c[:, None],
-                    mask=(j < points)[None, :] & (c < channels)[:, None],
-                    other=0.0,
-                )
-                distance += tl.sum(other * other, axis=0)[None, :]
-                distance -= 2.0 * tl.dot(own, other, input_precision="ieee")
-        distance = tl.where((j < points)[None, :] & (j[None, :] != i[:, None]), distance, float("inf"))
+        there = (i < rows)[:, None] & (j < points)[None, :]
+        if CHANNELS > 0:
+            distance = tl.zeros([ROWS, POINTS], tl.float32)
+            for c in tl.static_range(CHANNELS):
+                own = tl.load(x + (patch * points + i) * CHANNELS + c, mask=i < rows, other=0.0)
+                other = tl.load(x + (patch * points + j) * CHANNELS + c, mask=j < points, other=0.0)
+                apart = own[:, None] - other[None, :]
+                distance += apart * apart
+        else:
+            own = tl.load(squares + patch * points + i, mask=i < rows, other=0.0)
+            other = tl.load(squares + patch * points + j, mask=j < points, other=0.0)
+            product = tl.load(x + (patch * rows + i)[:, None] * points + j[None, :], mask=there, other=0.0)
+            distance = tl.maximum(own[:, None] + other[None, :] - 2.0 * product, 0.0)
+        key = (distance.to(tl.int32, bitcast=True) & -POINTS) | j[None, :]
+        key = tl.where(there & (j[None, :] != i[:, None]), key, 0x7FFFFFFF)
         last = tl.zeros([ROWS], tl.int32)
         for n in range(K):
-            nearest, index = tl.min(distance, axis=1, return_indices=True)
-            last = tl.where(nearest < float("inf"), index.to(tl.int32), last)  # too few points: the farthest again
+            nearest = tl.min(key, axis=1)
+            last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)  # too few points: the farthest again
             tl.store(out + (patch * rows + i) * K + n, last, mask=i < rows)
-            distance = tl.where(j[None, :] == index[:, None], float("inf"), distance)
+            key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
 
     @triton.jit  # type: ignore[untyped-decorator]
-    def _edge_max(
-        a: Any, b: Any, index: Any, weight: Any, out: Any, points: Any, rows: Any, out_channels: Any,
+    def _edge_max(  # type: ignore[no-untyped-def]
+        a, b, index, weight, out, points, rows, out_channels,
         CHANNELS: tl.constexpr, STEP: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr,
-    ) -> None:  # fmt: skip
+    ):  # fmt: skip
         """Gather, add, ReLU, multiply and take the maximum over the neighbours, for ROWS points of one patch."""
         patch = tl.program_id(0).to(tl.int64)
         first = tl.program_id(1) * ROWS
@@ -137,3 +166,25 @@ if triton is not None:
         i = first + tl.arange(0, ROWS)
         inside = (i < rows)[:, None] & (d < out_channels)[None, :]
         tl.store(out + (patch * rows + i)[:, None] * out_channels + d[None, :], best, mask=inside)
+
+    @triton.jit  # type: ignore[untyped-decorator]
+    def _farthest(xyz, apart, seeds, count, wanted, first, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+        """Take the point farthest from those taken, again and again, in one program; xyz: (3, count)."""
+        lane = tl.arange(0, BLOCK)
+        last = first
+        for n in range(wanted):
+            tl.store(seeds + n, last.to(tl.int64))
+            x, y, z = tl.load(xyz + last), tl.load(xyz + count + last), tl.load(xyz + 2 * count + last)
+            best = tl.full([BLOCK], -1.0, tl.float32)
+            where = tl.zeros([BLOCK], tl.int32)
+            for start in range(0, count, BLOCK):
+                j = start + lane
+                dx = tl.load(xyz + j, mask=j < count, other=0.0) - x
+                dy = tl.load(xyz + count + j, mask=j < count, other=0.0) - y
+                dz = tl.load(xyz + 2 * count + j, mask=j < count, other=0.0) - z
+                nearest = tl.load(apart + j, mask=j < count, other=-1.0)  # what lies beyond is never the farthest
+                nearest = tl.minimum(nearest, dx * dx + dy * dy + dz * dz)
+                tl.store(apart + j, nearest, mask=j < count)
+                farther = nearest > best
+                best, where = tl.where(farther, nearest, best), tl.where(farther, j, where)
+            last = tl.min(tl.where(best == tl.max(best, axis=0), where, count), axis=0)  # the first of equals

@@ -21,7 +21,7 @@ class SOAP(torch.optim.Optimizer):
     """
 
     def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: float | torch.Tensor = 1e-3) -> None:
-        super().__init__(parameters, {"lr": lr})
+        super().__init__(parameters, {"lr": lr, "capturable": True})  # so that a loaded "step" is on its device
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from straightpcf.points.errors import InternalError, JobCanceled, SpoolFull, StraightPCFError, TooLarge
+from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["Cancel", "Done", "Failed", "Preview", "Progress", "Ready", "WorkerSpec", "run_worker"]
 
 PROGRESS_INTERVAL_SECONDS = 0.05
-WARM_UP_POINTS = 1200  # more than a patch, so that the usual path is the one that is warm
+# More than a patch on a CPU, more than a batch of patches on a device, so that the usual path is the one that is warm.
+WARM_UP_POINTS, DEVICE_WARM_UP_POINTS = 1200, 12_000
 
 logger = logging.getLogger(__name__)
 
@@ -113,8 +115,10 @@ def _load(spec: WorkerSpec) -> Filter:
     from straightpcf.model.filter import load_filter
 
     denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads, tile_points=spec.tile_points)
-    directions = np.random.default_rng(0).normal(size=(WARM_UP_POINTS, 3))
-    denoiser.denoise(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    count = WARM_UP_POINTS if denoiser.device == "cpu" else DEVICE_WARM_UP_POINTS
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    sphere = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    denoiser.denoise(sphere, DenoiseOptions(iterations=2))  # between passes points are spread
     return denoiser
 
 

@@ -92,6 +92,30 @@ def test_a_shape_is_captured_when_it_comes_again_and_reads_fresh_inputs() -> Non
         assert len(captured) == (2 if turn else 0)
 
 
+def test_the_graph_that_was_used_last_is_given_up_last() -> None:
+    captured = []
+
+    def capture(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
+        captured.append(run)
+        return capture_by_calling(run)
+
+    graphs = Graphs(lambda x, owned, distance, rows: x[:, :rows], capture)
+
+    def call(batch: int) -> None:
+        for _ in range(2):
+            graphs(torch.rand(batch, 1000, 3), torch.ones(batch), None, 1000)
+
+    for batch in range(1, 17):
+        call(batch)
+    call(1)
+    assert len(captured) == 16
+    call(17)  # one more than are kept: that of 2 goes
+    call(1)
+    assert len(captured) == 17
+    call(2)
+    assert len(captured) == 18
+
+
 def test_where_capturing_fails_the_work_goes_on_without_graphs(network: StraightPCF) -> None:
     def refuse(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
         raise RuntimeError("operation not permitted when stream is capturing")

@@ -30,6 +30,12 @@ def test_knn_never_returns_the_point_itself() -> None:
     assert not (index == torch.arange(500)[:, None]).any()
 
 
+def test_squared_distances_are_those_of_the_differences() -> None:
+    a, b = torch.randn(2, 7, 3) + 100, torch.randn(2, 11, 3) + 100
+    expected = torch.cdist(a.double(), b.double()).square()
+    torch.testing.assert_close(ops.squared_distances(a, b).double(), expected, rtol=1e-3, atol=1e-6)
+
+
 @pytest.mark.parametrize("count", [2, 20, 33])
 def test_knn_repeats_neighbours_when_there_are_too_few(count: int) -> None:
     x = torch.randn(1, count, 3)
