@@ -69,7 +69,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     source = PatchSource.read(arguments.data / "punet_train.npz", validation=True)
     batch = source.draw(np.random.default_rng(1), arguments.patches)
-    parts = list(zip(*(torch.split(t, _AT_ONCE) for t in (batch.noisy, batch.clean, batch.time)), strict=True))
+    parts = batch.split(-(-arguments.patches // _AT_ONCE))
     quarter = (4 * batch.time.flatten()).long()
     print(f"{'velocities':44} {'across, of each module (in quarters of t)':58} along   end, across")
     for name in arguments.states:
@@ -81,7 +81,7 @@ def main() -> None:
         for stack in [modules, modules * 2] if len(modules) == 1 else [modules]:
             for module in stack:
                 module.eval()
-            found = torch.cat([errors(stack, Batch(*part)) for part in parts])
+            found = torch.cat([errors(stack, part) for part in parts])
             label = name if stack is modules else f"{name}, twice"
             for k in range(len(stack)):
                 across, along = found[:, 2 * k], found[:, 2 * k + 1]

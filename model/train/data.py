@@ -18,6 +18,7 @@ from straightpcf.model.normals import recompute_normals
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = [
+    "AROUND",
     "CANDIDATES",
     "EARLIEST",
     "FIRST_NOISE",
@@ -26,6 +27,7 @@ __all__ = [
     "NEAR_WEIGHT",
     "NOISE_STD",
     "PATCH_SIZE",
+    "REACH",
     "SCALES",
     "TOUCH_UNTIL",
     "VALIDATION_EVERY",
@@ -33,6 +35,7 @@ __all__ = [
     "PatchSource",
     "Surface",
     "held_out_shapes",
+    "reach_of",
 ]
 
 PATCH_SIZE = 1000
@@ -55,6 +58,8 @@ CANDIDATES = 4000
 # The filter keeps of a patch what lies near its seed (a third, at 3-fold coverage): of the points that come first in a
 # batch, and so into the loss, nine of ten are of the nearer half.
 NEAR_SHARE, NEAR_WEIGHT = 0.5, 9.0
+# Of the surface around a patch that many points are kept, of the share that a patch has and half as much more.
+AROUND, REACH = 6000, 1.5
 # Until then what is across the surface is aimed at the surface itself; later it is known no better than the points are.
 TOUCH_UNTIL = 0.98
 
@@ -65,12 +70,17 @@ class Batch:
 
     noisy: (B, P, 3) float32 x_0, clean: (B, P, 3) float32 y, time: (B, 1, 1) float32 in [EARLIEST, 1). Across the
     surface y is on the plane that touches it where x_t is nearest (`Surface.touching`), and x_0 on the line from there
-    through x_t.
+    through x_t. drawn: (B, P, 3) float32, y before that, the clean points themselves; surface, normals: (B, M, 3)
+    float32, points of the surface around the patch and their unit normals: for y where another place than x_t counts
+    (`touching`).
     """
 
     noisy: torch.Tensor
     clean: torch.Tensor
     time: torch.Tensor
+    drawn: torch.Tensor
+    surface: torch.Tensor
+    normals: torch.Tensor
 
     def at(self, time: torch.Tensor) -> torch.Tensor:
         """Return x_t = (1 - t) x_0 + t y, (B, P, 3)."""
@@ -78,7 +88,24 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """Return the same batch on another device."""
-        return Batch(self.noisy.to(device), self.clean.to(device), self.time.to(device))
+        return Batch(*(tensor.to(device) for tensor in self._tensors()))
+
+    def split(self, parts: int) -> list[Batch]:
+        """Return the same patches in batches, at most `parts` of them."""
+        return [Batch(*some) for some in zip(*(tensor.chunk(parts) for tensor in self._tensors()), strict=True)]
+
+    def touching(self, here: torch.Tensor) -> torch.Tensor:
+        """Do for the first R points of each patch, here (B, R, 3), what `Surface.touching` does."""
+        pairs = [(here, self.surface)]
+        if here.device.type == "cpu":  # one patch's distances fit the cache, a batch's do not
+            pairs = list(zip(here.chunk(len(here)), self.surface.chunk(len(here)), strict=True))
+        near = _rows(torch.cat([torch.cdist(*pair).argmin(dim=2) for pair in pairs]))
+        foot, normal = self.surface.gather(1, near), self.normals.gather(1, near)
+        clean = self.drawn[:, : here.shape[1]]
+        return clean + ((foot - clean) * normal).sum(dim=2, keepdim=True) * normal
+
+    def _tensors(self) -> tuple[torch.Tensor, ...]:
+        return self.noisy, self.clean, self.time, self.drawn, self.surface, self.normals
 
 
 @dataclass(frozen=True)
@@ -92,6 +119,15 @@ class Surface:
     def _tree(self) -> cKDTree:
         return cKDTree(self.xyz)
 
+    def around(
+        self, seed: npt.NDArray[np.float64], share: float
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return AROUND points and their normals of that share of the surface that is nearest to the seed (3,)."""
+        reach = reach_of(share, len(self.xyz))
+        _, near = self._tree.query(seed, k=reach)
+        near = near[np.linspace(0, reach - 1, AROUND).astype(np.int64)]
+        return self.xyz[near], self.normals[near]
+
     def touching(self, here: npt.NDArray[np.float64], clean: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Shift clean points (P, 3) along normals, onto the planes that touch the surface nearest to `here` (P, 3).
 
@@ -104,6 +140,11 @@ class Surface:
             clean + ((self.xyz[foot] - clean) * normal).sum(axis=1, keepdims=True) * normal
         )
         return shifted
+
+
+def reach_of(share: float, count: int) -> int:
+    """Return how many of a surface's points, those nearest to a seed, are that share of it or fill a batch."""
+    return min(count, max(AROUND, round(share * count)))
 
 
 def held_out_shapes(names: Iterable[str]) -> set[str]:
@@ -170,9 +211,8 @@ class PatchSource:
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""
-        pairs = [self._patch(rng, augment=augment) for _ in range(batch_size)]
-        noisy, clean, time = (np.stack(part).astype(np.float32) for part in zip(*pairs, strict=True))
-        return Batch(torch.from_numpy(noisy), torch.from_numpy(clean), torch.from_numpy(time).view(-1, 1, 1))
+        patches = [self._patch(rng, augment=augment) for _ in range(batch_size)]
+        return Batch(*(torch.from_numpy(np.stack(part).astype(np.float32)) for part in zip(*patches, strict=True)))
 
     def _patch(self, rng: np.random.Generator, *, augment: bool) -> tuple[npt.NDArray[np.float64], ...]:
         which = int(rng.integers(len(self.clouds)))
@@ -198,7 +238,14 @@ class PatchSource:
         turn[: int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
         inside = inside[np.argsort(turn)]
         here, clean = here[inside], clean[inside]
+        drawn = clean
+        surface, normals = self.surfaces[which].around(seed, REACH * PATCH_SIZE / len(cloud))
         if time < TOUCH_UNTIL:
             clean = self.surfaces[which].touching(here, clean)
         noisy = (here - time * clean) / (1 - time)
-        return (noisy - origin) @ transform, (clean - origin) @ transform, np.array(time)
+        placed = [(points - origin) @ transform for points in (noisy, clean, drawn, surface)]
+        return placed[0], placed[1], np.array([[time]]), placed[2], placed[3], normals @ transform / scale
+
+
+def _rows(index: torch.Tensor) -> torch.Tensor:
+    return index.unsqueeze(2).expand(-1, -1, 3)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from straightpcf.model.train.data import (
+    AROUND,
     CANDIDATES,
     EARLIEST,
     FIRST_NOISE,
@@ -15,15 +18,15 @@ from straightpcf.model.train.data import (
     NEAR_WEIGHT,
     NOISE_STD,
     PATCH_SIZE,
+    REACH,
     SCALES,
     TOUCH_UNTIL,
     Batch,
     PatchSource,
+    reach_of,
 )
 
 __all__ = ["DevicePatchSource", "random_rotations"]
-
-_NEAR_SURFACE = 5 * CANDIDATES  # the finest clouds have five times the points of the coarsest
 
 
 class DevicePatchSource:
@@ -40,8 +43,11 @@ class DevicePatchSource:
         self._clouds = _padded(source.clouds, device)
         self._noise = torch.from_numpy(FIRST_NOISE).float().to(device)
         self._zooms = torch.from_numpy(source.zooms).float().to(device)
-        self._surfaces = _padded([surface.xyz for surface in source.surfaces], device)
-        self._normals = _padded([surface.normals for surface in source.surfaces], device)
+        self._surfaces = _repeated([surface.xyz for surface in source.surfaces], device)
+        self._normals = _repeated([surface.normals for surface in source.surfaces], device)
+        pairs = zip(source.clouds, source.surfaces, strict=True)
+        reach = [reach_of(REACH * PATCH_SIZE / len(cloud), len(surface.xyz)) for cloud, surface in pairs]
+        self._reach, self._farthest = torch.tensor(reach, device=device), max(reach)
 
     def draw(self, batch_size: int) -> Batch:
         """Draw an augmented batch of `batch_size` patches."""
@@ -62,12 +68,15 @@ class DevicePatchSource:
         turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
         inside = inside.gather(1, turn.argsort(dim=1))
         noisy, here, clean = (part.gather(1, _rows(inside)) for part in (noisy, here, clean))
+        surface, normals = self._around(which, clouds.gather(1, _rows(seeds[:, None])))
+        turn = random_rotations(batch_size, device)
+        noisy, here, clean, surface = ((part - origin) @ turn * scale for part in (noisy, here, clean, surface))
+        batch = Batch(noisy, clean, time, clean, surface, normals @ turn)
         early = time < TOUCH_UNTIL
-        clean = torch.where(early, self.touching(which, here, clean), clean)
+        touched = torch.where(early, batch.touching(here), clean)
         # Late in time x_0 stays as drawn: float32 cannot find it again from x_t.
-        noisy = torch.where(early, torch.lerp(clean, here, 1 / (1 - time)), noisy)
-        transform = random_rotations(batch_size, device) * scale
-        return Batch((noisy - origin) @ transform, (clean - origin) @ transform, time)
+        noisy = torch.where(early, torch.lerp(touched, here, 1 / (1 - time)), noisy)
+        return replace(batch, noisy=noisy, clean=touched)
 
     def _shown(self, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw the times and sizes, (B, 1, 1), in which patches of the clouds numbered `which` (B,) are shown."""
@@ -79,14 +88,14 @@ class DevicePatchSource:
         time = torch.where(early, (1 - zoomed * self._noise[level] / NOISE_STD).clamp(min=EARLIEST), time)
         return time.view(-1, 1, 1), torch.where(early, zoomed, scale).view(-1, 1, 1)
 
-    def touching(self, which: torch.Tensor, here: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
-        """Do for (B, P, 3) points of the clouds numbered `which` (B,) what `Surface.touching` does."""
-        surface, normals = self._surfaces[which], self._normals[which]  # (B, M, 3)
-        squared = (surface - here.mean(dim=1, keepdim=True)).square().sum(dim=2)
-        near = squared.topk(min(_NEAR_SURFACE, surface.shape[1]), dim=1, largest=False).indices
-        near = near.gather(1, torch.cdist(here, surface.gather(1, _rows(near))).argmin(dim=2))  # (B, P)
-        foot, normal = surface.gather(1, _rows(near)), normals.gather(1, _rows(near))
-        return clean + ((foot - clean) * normal).sum(dim=2, keepdim=True) * normal
+    def _around(self, which: torch.Tensor, seeds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Do for seeds (B, 1, 3) on the clouds numbered `which` (B,) what `Surface.around` does."""
+        surface, normals = self._surfaces[which], self._normals[which]
+        squared = (surface - seeds).square().sum(dim=2)
+        near = squared.topk(self._farthest, dim=1, largest=False).indices
+        places = torch.linspace(0, 1, AROUND, device=squared.device) * (self._reach[which, None] - 1)
+        near = _rows(near.gather(1, places.long()))
+        return surface.gather(1, near), normals.gather(1, near)
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:
@@ -105,6 +114,13 @@ def _padded(clouds: list[npt.NDArray[np.float64]], device: torch.device) -> torc
     for padded, cloud in zip(out, clouds, strict=True):
         padded[: len(cloud)] = torch.from_numpy(cloud).to(padded)
     return out
+
+
+def _repeated(clouds: list[npt.NDArray[np.float64]], device: torch.device) -> torch.Tensor:
+    """Stack clouds, those of fewer points filled up with their own from the first on."""
+    count = max(map(len, clouds))
+    stacked = np.stack([np.resize(cloud, (count, 3)) for cloud in clouds])
+    return torch.from_numpy(stacked.astype(np.float32)).to(device)
 
 
 def _rows(index: torch.Tensor) -> torch.Tensor:

@@ -94,6 +94,8 @@ def train(
     run_dir.mkdir(parents=True, exist_ok=True)
     state_path = run_dir / STATE_FILE
     place = torch.device(device)
+    if place.type == "cuda":
+        torch.cuda.set_device(place)  # captures and Triton work on the current one
 
     resuming = state_path.exists()
     network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
@@ -197,5 +199,4 @@ def _validate(loss: NetworkLoss, network: StraightPCF, average: Average, fixed: 
     averaged = copy.deepcopy(network)
     averaged.load_state_dict(average.tensors)
     averaged.eval()
-    parts = zip(*(tensor.chunk(8) for tensor in (fixed.noisy, fixed.clean, fixed.time)), strict=True)
-    return round(float(np.mean([loss(averaged, Batch(*part)).item() for part in parts])), 5)
+    return round(float(np.mean([loss(averaged, part).item() for part in fixed.split(8)])), 5)

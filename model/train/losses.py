@@ -13,7 +13,7 @@ from functools import cache
 import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train.data import NOISE_STD, Batch
+from straightpcf.model.train.data import NOISE_STD, TOUCH_UNTIL, Batch
 from straightpcf.model.turns import turns
 
 __all__ = ["LAMBDA_1", "LAMBDA_2", "coupled_loss", "distance_loss", "precision", "velocity_loss"]
@@ -38,30 +38,51 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
 
     The K modules take N = euler_steps rounds of shorter and shorter ways along their own path, as the filter runs
     them: evaluation k of N K starts where k - 1 left the points, at time t + (k - 1) s / (N K) for a pass of length
-    s = 1 - t, 1 at most, in a position of its own, and all but the first move the first `rows` points only. The paper
+    s = 1 - t, 1 at most, in a position of its own, and all but the first move the first `rows` points only. These are
+    led to the surface nearest to where the pass leaves them (`_targets`). The paper
     has N = 1 and leaves out where the last module leaves the points: then it learns to go on straight, also from where
     the first has gone wrong, and the stack ends farther from the surface than two copies of a single module do
     (docs/training.md).
     """
     evaluations = [velocity for _ in range(euler_steps) for velocity in network.velocity_modules]
     positions = _turns(len(evaluations), batch.noisy.device)
-    target = batch.clean - batch.noisy
-    weight = precision(batch, target.shape[1])
-    x = batch.at(batch.time)
+    start = x = batch.at(batch.time)
     step = _to_go(batch) / len(evaluations)
-    loss = x.new_zeros(())
     beyond = torch.zeros_like(x[:, rows:])
+    steps: list[tuple[torch.Tensor, torch.Tensor]] = []
     for k, (velocity, turn) in enumerate(zip(evaluations, positions, strict=True), start=1):
         v = velocity(x @ turn, rows if k > 1 else None) @ turn.mT
-        some = slice(v.shape[1])
-        there = batch.at(batch.time + k * step)[:, some]
         if k == 1:
             beyond = v[:, rows:]
-        moved = x[:, some] + step * v
-        loss = loss + _weighted(v - target[:, some], weight[:, some])
-        loss = loss + LAMBDA_1 * _weighted(moved - there, weight[:, some])
+        moved = x[:, : v.shape[1]] + step * v
+        steps.append((v, moved))
         x = moved if k == 1 else torch.cat([moved, x[:, rows:] + step * beyond], dim=1)
+    target = _targets(batch, start, x, steps[-1][0][:, :rows])
+    weight = precision(batch, target.shape[1])
+    loss = x.new_zeros(())
+    for k, (v, moved) in enumerate(steps, start=1):
+        some = slice(v.shape[1])
+        loss = loss + _weighted(v - target[:, some], weight[:, some])
+        there = start[:, some] + k * step * target[:, some]
+        loss = loss + LAMBDA_1 * _weighted(moved - there, weight[:, some])
     return loss / euler_steps
+
+
+@torch.no_grad()
+def _targets(batch: Batch, start: torch.Tensor, end: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+    """Return the velocities (B, P, 3) that lead from x_t, `start`, to the surface.
+
+    For the rows of `velocity`, the last evaluation's, it is the surface nearest to where they are led now: their place
+    after the pass, `end`, and on from there for what a path from before t = 0 has left. Of walls that the noise has
+    mixed, each is as good as the other; between them is none. For the others it is the surface nearest to x_t.
+    """
+    rows = velocity.shape[1]
+    target = batch.clean - batch.noisy
+    left = 1 - batch.time
+    there = end[:, :rows] + (left - _to_go(batch)) * velocity
+    nearest = (batch.touching(there) - start[:, :rows]) / left
+    target[:, :rows] = torch.where(batch.time < TOUCH_UNTIL, nearest, target[:, :rows])
+    return target
 
 
 @torch.no_grad()

@@ -51,6 +51,11 @@ def drawn(source: PatchSource, count: int, *, on_device: bool) -> Batch:
     return DevicePatchSource(source, torch.device("cpu")).draw(count)
 
 
+def batch_of(noisy: torch.Tensor, clean: torch.Tensor, time: torch.Tensor) -> Batch:
+    """Make a batch of clean points (B, P, 3) that are their own surface, z upwards."""
+    return Batch(noisy, clean, time, clean, clean, torch.tensor([0.0, 0.0, 1.0]).expand_as(clean))
+
+
 def test_training_shapes_and_validation_shapes_are_disjoint(data: Path) -> None:
     parts = [PatchSource.read(data, validation=v) for v in (False, True)]
     clouds = [{cloud.tobytes() for cloud in part.clouds} for part in parts]
@@ -118,7 +123,7 @@ def test_half_of_the_patches_are_in_the_sizes_of_a_first_pass(*, on_device: bool
 def test_one_pass_is_asked_to_go_no_farther_than_it_can() -> None:
     network = StraightPCF(couplings=2).eval()
     clean = 0.1 * torch.randn(2, 100, 3)
-    batch = Batch(clean + NOISE_STD * torch.randn_like(clean), clean, torch.tensor([-0.5, -0.2]).view(2, 1, 1))
+    batch = batch_of(clean + NOISE_STD * torch.randn_like(clean), clean, torch.tensor([-0.5, -0.2]).view(2, 1, 1))
 
     class Straight(torch.nn.Module):
         def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
@@ -145,10 +150,52 @@ def test_noisy_points_are_led_to_the_surface_and_not_beneath_it() -> None:
     beneath = 1 - (clean * out).sum(axis=1)
     assert beneath.mean() == pytest.approx(noise**2, rel=0.1)  # H s^2
     assert abs((1 - (chosen * out).sum(axis=1)).mean()) < 0.1 * noise**2
-    on_device = DevicePatchSource(source, torch.device("cpu"))
-    wide = (torch.from_numpy(part).float()[None] for part in (here, clean))
-    theirs = on_device.touching(torch.zeros(1, dtype=torch.long), *wide)
-    assert np.abs(theirs[0].numpy() - chosen).max() < 1e-5
+    wide = [torch.from_numpy(part).float()[None] for part in (clean, here, *source.surfaces[0].around(ball[0], 0.3))]
+    batch = Batch(wide[1], wide[0], torch.zeros(1, 1, 1), wide[0], wide[2], wide[3])
+    assert np.abs(batch.touching(wide[1])[0].numpy() - chosen).max() < 1e-5
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_the_surface_in_a_batch_is_that_of_its_points(*, on_device: bool) -> None:
+    # Clouds of different size, whose finest have fewer points than a batch holds and more.
+    shapes = [[sphere(3000, 0).astype(np.float32)], [sphere(n, n).astype(np.float32) for n in (5000, 9000)]]
+    batch = drawn(PatchSource(shapes), 8, on_device=on_device)
+    assert all(torch.isfinite(tensor).all() for tensor in (batch.noisy, batch.clean, batch.surface, batch.normals))
+    torch.testing.assert_close(batch.normals.norm(dim=2), torch.ones(8, batch.normals.shape[1]), atol=1e-4, rtol=0)
+    apart = torch.cdist(batch.drawn, batch.surface).amin(dim=2)
+    spacing = 2 * batch.surface.norm(dim=2).amax(dim=1) / 1000**0.5
+    assert (apart.amax(dim=1) < 2 * spacing).all()
+    early = batch.time.flatten() < 0.5
+    heights = (batch.clean - batch.touching(batch.at(batch.time))).norm(dim=2)[early]
+    assert heights.quantile(0.9) < 1e-4  # the same planes, but at the patch's rim
+
+
+def test_points_between_two_walls_are_led_to_the_one_that_they_are_brought_near() -> None:
+    side = torch.linspace(-0.2, 0.2, 33)
+    lower, upper = (torch.cartesian_prod(side, side, torch.tensor([z]))[None] for z in (-0.03, 0.03))
+    walls, up = torch.cat([lower, upper], dim=1), torch.tensor([0.0, 0.0, 1.0])
+    drawn = upper[:, ::2]  # all are of the upper wall, and lie above it
+    batch = Batch(drawn + 0.01 * up, drawn, torch.zeros(1, 1, 1), drawn, walls, up.expand_as(walls))
+
+    class Along(torch.nn.Module):
+        """Brings every point to the same height."""
+
+        def __init__(self, height: float) -> None:
+            super().__init__()
+            self.height = torch.nn.Parameter(torch.tensor(height))
+
+        def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
+            return ((self.height - 0.04) * up).expand(1, x.shape[1], 3)[:, :rows] @ turns(1)
+
+    def slope(height: float) -> float:
+        network = StraightPCF(couplings=1)
+        network.velocity_modules = torch.nn.ModuleList([module := Along(height)])
+        coupled_loss(network, batch, drawn.shape[1]).backward()  # type: ignore[no-untyped-call]
+        assert module.height.grad is not None
+        return module.height.grad.item()
+
+    assert slope(0.01) < 0 < slope(-0.01)  # up from there to the upper wall, down from here to the lower one
+    assert max(abs(slope(0.03)), abs(slope(-0.03))) < 1e-3 * slope(-0.01)
 
 
 @pytest.mark.parametrize("on_device", [False, True])
@@ -168,11 +215,23 @@ def test_errors_along_a_surface_count_only_where_the_noise_leaves_them_knowable(
     torch.manual_seed(0)
     noisy = plane + NOISE_STD * torch.randn_like(plane)
     inner = (plane.abs() < 0.12).all(dim=2)[0]
-    weight = precision(Batch(noisy, plane, torch.full((1, 1, 1), time)), plane.shape[1])[0, inner]
+    weight = precision(batch_of(noisy, plane, torch.full((1, 1, 1), time)), plane.shape[1])[0, inner]
     torch.testing.assert_close(weight, weight.mT)
     across, others = weight[:, 2, 2], weight[:, :2, :2].diagonal(dim1=1, dim2=2)
     assert across.mean() == pytest.approx(1, abs=0.02)
     assert others.mean() == pytest.approx(along, rel=0.15)
+
+
+def test_an_optimiser_loaded_counts_its_steps_where_the_parameters_are() -> None:
+    # On a GPU the count must be there: what a captured graph reads from the host stands still.
+    here = torch.nn.Parameter(torch.zeros(4, 4))
+    here.grad = torch.ones(4, 4)
+    optimiser = SOAP([here])
+    optimiser.step()
+    there = torch.nn.Parameter(torch.zeros(4, 4, device="meta"))
+    other = SOAP([there])
+    other.load_state_dict(optimiser.state_dict())
+    assert other.state[there]["step"].device == there.device
 
 
 def test_soap_finds_the_axes_of_an_ill_conditioned_problem() -> None:
