@@ -34,7 +34,7 @@ def load() -> bool:
     if triton is None or os.environ.get("STRAIGHTPCF_NO_KERNELS"):
         return False
     try:
-        _prove(torch.device("cuda"))
+        _prove(torch.device("cuda"), 1000)
     except Exception as exc:  # the compiler's own errors have no common base
         warnings.warn(f"the Triton kernels do not run here, plain torch does: {exc}", stacklevel=2)
         return False
@@ -81,19 +81,19 @@ def farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
     return seeds
 
 
-def _prove(device: torch.device) -> None:
-    """Raise unless each kernel does what its torch twin does, in the shapes of a patch of the shipped network."""
+def _prove(device: torch.device, points: int) -> None:
+    """Raise unless each kernel does what its torch twin does for a patch of so many points of the shipped network."""
     from straightpcf.model import device_patches, ops  # they import this module
 
     generator = torch.Generator(device).manual_seed(0)
     for channels, k in ((3, 16), (3, 32), (16, 32), (32, 32), (64, 32)):
-        x = torch.randn(1, 1000, channels, device=device, generator=generator)
-        agree = knn(x, k, 1000).long().sort().values == ops.knn_torch(x, k, 1000).sort().values
-        if agree.float().mean() < 0.99:
-            raise RuntimeError(f"other nearest neighbours among {channels} channels")
-    index = knn(x, 32, 1000)
+        x = torch.randn(1, points, channels, device=device, generator=generator)
+        found, expected = (_distances(x, index) for index in (knn(x, k, points), ops.knn_torch(x, k, points)))
+        if not torch.allclose(found, expected, rtol=1e-3):
+            raise RuntimeError(f"no nearest neighbours in {channels} channels")
+    index = knn(x, 32, points)
     for width in (16, 32, 64, 128, 256):
-        a, b = torch.randn(2, 1, 1000, width, device=device, generator=generator)
+        a, b = torch.randn(2, 1, points, width, device=device, generator=generator)
         weight = torch.randn(width, width, device=device, generator=generator)
         expected = ops.edge_max_torch(a, b, index, weight)
         if not (edge_max(a, b, index, weight) - expected).norm() < 1e-2 * expected.norm():
@@ -101,6 +101,11 @@ def _prove(device: torch.device) -> None:
     cloud = torch.randn(5000, 3, device=device, generator=generator)
     if not torch.equal(farthest(cloud, 8, 1), device_patches.farthest_torch(cloud, 8, 1)):
         raise RuntimeError("other farthest points")
+
+
+def _distances(x: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Return the squared distances of the points (1, P, C) from others of theirs (1, P, k), ascending."""
+    return (x[0][index[0].long()] - x[0][:, None]).square().sum(dim=2).sort(dim=1).values
 
 
 if triton is not None:

@@ -32,6 +32,7 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     index = ops.knn_torch(b, 32, 70)
     found, expected = cuda.edge_max(a[:, :70], b, index.int(), weight), ops.edge_max_torch(a[:, :70], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
+cuda._prove(torch.device(device), 1000 if device == "cuda" else 150)
 cloud = torch.randn(9000, 3, generator=generator).to(device)
 for wanted, first in ((1, 0), (20, 1), (20, 8999)):
     assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
