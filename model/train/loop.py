@@ -80,8 +80,9 @@ def train(
     up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
     another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each batch, one thread
     each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on (`coupled_loss`).
-    Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; the same seed, device
-    and thread count give the same weights. Raises InvalidOptions where `init` is missing or unfit.
+    Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed and
+    thread count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
+    missing or unfit.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
