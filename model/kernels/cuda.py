@@ -44,17 +44,19 @@ def load() -> bool:
 def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
     """Do what `ops.knn` does for at most MOST_POINTS points a patch; returns int32 indices.
 
-    Squared distances are compared to 12 bits after the leading one or more, equal ones by index.
+    Squared distances that agree in their leading bits, 12 at least and mostly 15 or more, go by index.
     """
     batch, points, channels = x.shape
     if points > MOST_POINTS:
         raise ValueError(f"a patch of {points} points; the kernel takes {MOST_POINTS}")
     out = torch.empty(batch, rows, k, dtype=torch.int32, device=x.device)
-    direct = channels < _DIRECT
-    given = x.contiguous() if direct else torch.bmm(x[:, :rows], x.mT)
+    direct, size = channels < _DIRECT, triton.next_power_of_2(points)
+    given = squares = x.contiguous()
+    if not direct:
+        given, squares = torch.bmm(x[:, :rows], x.mT), x.square().sum(dim=2)
     _nearest[batch, triton.cdiv(rows, _ROWS)](
-        given, x.square().sum(dim=2), out, points, rows,
-        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=triton.next_power_of_2(points), num_warps=1,
+        given, squares, out, points, rows,
+        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=size, ROOM=31 - size.bit_length(), num_warps=1,
     )  # fmt: skip
     return out
 
@@ -114,12 +116,12 @@ if triton is not None:
     @triton.jit  # type: ignore[untyped-decorator]
     def _nearest(  # type: ignore[no-untyped-def]
         x, squares, out, points, rows,
-        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr,
+        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr, ROOM: tl.constexpr,
     ):  # fmt: skip
         """Select the K nearest of all points for ROWS points of one patch, by K minima inside one warp.
 
-        x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points. A distance gives
-        its low bits to the point's index: one comparison finds both.
+        x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points, and `squares`
+        their squared lengths. A key is ROOM bits of a distance above the point's index: one comparison finds both.
         """
         patch = tl.program_id(0).to(tl.int64)
         i = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
@@ -137,8 +139,14 @@ if triton is not None:
             other = tl.load(squares + patch * points + j, mask=j < points, other=0.0)
             product = tl.load(x + (patch * rows + i)[:, None] * points + j[None, :], mask=there, other=0.0)
             distance = tl.maximum(own[:, None] + other[None, :] - 2.0 * product, 0.0)
-        key = (distance.to(tl.int32, bitcast=True) & -POINTS) | j[None, :]
-        key = tl.where(there & (j[None, :] != i[:, None]), key, 0x7FFFFFFF)
+        # As integers, squared distances keep their order; of what they are above the row's least, the leading bits fit.
+        valid = there & (j[None, :] != i[:, None])
+        bits = distance.to(tl.int32, bitcast=True)
+        least = tl.min(tl.where(valid, bits, 0x7FFFFFFF), axis=1)
+        reach = tl.maximum(tl.max(tl.where(valid, bits, 0), axis=1) - least, 0)
+        length = (reach.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 126  # in bits: the exponent of a float
+        key = ((bits - least[:, None]) >> tl.maximum(length - ROOM, 0)[:, None]) * POINTS + j[None, :]
+        key = tl.where(valid, key, 0x7FFFFFFF)
         last = tl.zeros([ROWS], tl.int32)
         for n in range(K):
             nearest = tl.min(key, axis=1)

@@ -34,6 +34,7 @@ __all__ = [
     "Batch",
     "PatchSource",
     "Surface",
+    "gathered",
     "held_out_shapes",
     "reach_of",
 ]
@@ -99,8 +100,8 @@ class Batch:
         pairs = [(here, self.surface)]
         if here.device.type == "cpu":  # one patch's distances fit the cache, a batch's do not
             pairs = list(zip(here.chunk(len(here)), self.surface.chunk(len(here)), strict=True))
-        near = _rows(torch.cat([torch.cdist(*pair).argmin(dim=2) for pair in pairs]))
-        foot, normal = self.surface.gather(1, near), self.normals.gather(1, near)
+        near = torch.cat([torch.cdist(*pair).argmin(dim=2) for pair in pairs])
+        foot, normal = gathered(self.surface, near), gathered(self.normals, near)
         clean = self.drawn[:, : here.shape[1]]
         return clean + ((foot - clean) * normal).sum(dim=2, keepdim=True) * normal
 
@@ -247,5 +248,6 @@ class PatchSource:
         return placed[0], placed[1], np.array([[time]]), placed[2], placed[3], normals @ transform / scale
 
 
-def _rows(index: torch.Tensor) -> torch.Tensor:
-    return index.unsqueeze(2).expand(-1, -1, 3)
+def gathered(points: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Return the points (B, P, 3) that lie at rows index (B, n) of their patch: (B, n, 3)."""
+    return points.gather(1, index.unsqueeze(2).expand(-1, -1, 3))

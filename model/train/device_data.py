@@ -23,6 +23,7 @@ from straightpcf.model.train.data import (
     TOUCH_UNTIL,
     Batch,
     PatchSource,
+    gathered,
     reach_of,
 )
 
@@ -55,9 +56,9 @@ class DevicePatchSource:
         which = torch.randint(len(self._clouds), (batch_size,), device=device)
         seeds = (torch.rand(batch_size, device=device) * self._counts[which]).long()
         clouds = self._clouds[which]  # (B, N, 3)
-        squared = (clouds - clouds.gather(1, _rows(seeds[:, None]))).square().sum(dim=2)
+        squared = (clouds - gathered(clouds, seeds[:, None])).square().sum(dim=2)
         near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
-        clean = clouds.gather(1, _rows(near))
+        clean = gathered(clouds, near)
         time, scale = self._shown(which)
         noisy = clean + NOISE_STD / scale * torch.randn_like(clean)
         here = torch.lerp(noisy, clean, time)
@@ -67,8 +68,8 @@ class DevicePatchSource:
         turn = torch.empty(batch_size, PATCH_SIZE, device=device).exponential_()
         turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
         inside = inside.gather(1, turn.argsort(dim=1))
-        noisy, here, clean = (part.gather(1, _rows(inside)) for part in (noisy, here, clean))
-        surface, normals = self._around(which, clouds.gather(1, _rows(seeds[:, None])))
+        noisy, here, clean = (gathered(part, inside) for part in (noisy, here, clean))
+        surface, normals = self._around(which, gathered(clouds, seeds[:, None]))
         turn = random_rotations(batch_size, device)
         noisy, here, clean, surface = ((part - origin) @ turn * scale for part in (noisy, here, clean, surface))
         batch = Batch(noisy, clean, time, clean, surface, normals @ turn)
@@ -94,8 +95,8 @@ class DevicePatchSource:
         squared = (surface - seeds).square().sum(dim=2)
         near = squared.topk(self._farthest, dim=1, largest=False).indices
         places = torch.linspace(0, 1, AROUND, device=squared.device) * (self._reach[which, None] - 1)
-        near = _rows(near.gather(1, places.long()))
-        return surface.gather(1, near), normals.gather(1, near)
+        near = near.gather(1, places.long())
+        return gathered(surface, near), gathered(normals, near)
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:
@@ -121,7 +122,3 @@ def _repeated(clouds: list[npt.NDArray[np.float64]], device: torch.device) -> to
     count = max(map(len, clouds))
     stacked = np.stack([np.resize(cloud, (count, 3)) for cloud in clouds])
     return torch.from_numpy(stacked.astype(np.float32)).to(device)
-
-
-def _rows(index: torch.Tensor) -> torch.Tensor:
-    return index.unsqueeze(2).expand(-1, -1, 3)

@@ -39,10 +39,9 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
     The K modules take N = euler_steps rounds of shorter and shorter ways along their own path, as the filter runs
     them: evaluation k of N K starts where k - 1 left the points, at time t + (k - 1) s / (N K) for a pass of length
     s = 1 - t, 1 at most, in a position of its own, and all but the first move the first `rows` points only. These are
-    led to the surface nearest to where the pass leaves them (`_targets`). The paper
-    has N = 1 and leaves out where the last module leaves the points: then it learns to go on straight, also from where
-    the first has gone wrong, and the stack ends farther from the surface than two copies of a single module do
-    (docs/training.md).
+    led to the surface nearest to where the pass leaves them (`_targets`). The paper has N = 1 and leaves out where the
+    last module leaves the points: then it learns to go on straight, also from where the first has gone wrong, and the
+    stack ends farther from the surface than two copies of a single module do (docs/training.md).
     """
     evaluations = [velocity for _ in range(euler_steps) for velocity in network.velocity_modules]
     positions = _turns(len(evaluations), batch.noisy.device)

@@ -115,10 +115,11 @@ def _load(spec: WorkerSpec) -> Filter:
     from straightpcf.model.filter import load_filter
 
     denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads, tile_points=spec.tile_points)
-    count = WARM_UP_POINTS if denoiser.device == "cpu" else DEVICE_WARM_UP_POINTS
+    count, options = WARM_UP_POINTS, DenoiseOptions()
+    if denoiser.device != "cpu":  # between passes points are spread, which is compiled there, too
+        count, options = DEVICE_WARM_UP_POINTS, DenoiseOptions(iterations=2)
     directions = np.random.default_rng(0).normal(size=(count, 3))
-    sphere = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    denoiser.denoise(sphere, DenoiseOptions(iterations=2))  # between passes points are spread
+    denoiser.denoise(directions / np.linalg.norm(directions, axis=1, keepdims=True), options)
     return denoiser
 
 
