@@ -136,8 +136,8 @@ def _runner(options: argparse.Namespace) -> Run:
         return Filtered(result.xyz, result.iterations)
 
     def run_every(cloud: Floats, _: float) -> Filtered:
-        states, distances = every_pass(model, cloud, seed=options.seed)
-        chosen = passes(model.calibration, Trace("", 0.0, distances, ()))
+        states, distances, in_radii = every_pass(model, cloud, seed=options.seed)
+        chosen = passes(model.calibration, Trace("", 0.0, distances, (), noise_in_radii=in_radii))
         return Filtered(states[chosen], chosen, tuple(states[1:]))
 
     return run_every if options.every_pass else run

@@ -23,6 +23,8 @@ class Calibration:
     polish, settled: equally long; where d was above polish[i] at the start, pass i + 2 is made all the same if d is
     below settled[i] by then. On thin and intricate shapes d stays higher when the noise is gone, and further passes
     pull their sides together.
+    crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
+    dense points the second leaves more than of few.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
@@ -31,6 +33,7 @@ class Calibration:
     starts: tuple[float, ...] = (0.76, 0.905)
     polish: tuple[float, ...] = (0.45, 0.76, 0.905)
     settled: tuple[float, ...] = (0.2, 0.2, 0.2)
+    crowded: float = 0.042
     stirred: float = 0.5
     most: int = 4
 
@@ -61,14 +64,16 @@ class Calibration:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
 
-    def passes_left(self, distances: Sequence[float]) -> int:
+    def passes_left(self, distances: Sequence[float], noise_in_radii: float = 0.0) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
-        distances: d before each pass that was made, and now.
+        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`.
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
         polished = 1 + sum(start > limit for limit in self.polish)
+        if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:
+            polished = 3
         polishing = due <= done < polished and now < self.settled[done - 1]
         if done >= self.most or not (done < due or polishing or now > self.stirred):
             return 0

@@ -264,7 +264,7 @@ class Run:
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
-        return self.filter.calibration.passes_left(self.distances)
+        return self.filter.calibration.passes_left(self.distances, self.readings[0].noise_in_radii)
 
     def _evened(
         self, here: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None

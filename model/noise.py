@@ -9,7 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.calibration import Calibration
-from straightpcf.model.normalize import LOUD_NOISE, is_scene, parts_of, patch_scales, zoom_of, zoom_of_rest
+from straightpcf.model.normalize import (
+    LOUD_NOISE,
+    is_scene,
+    noise_in_radii,
+    parts_of,
+    patch_scales,
+    zoom_of,
+    zoom_of_rest,
+)
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
 from straightpcf.model.tiles import Tiling, parted
@@ -30,8 +38,9 @@ class Reading:
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
     object seen whole; zoom: the factor by which the pass shows an object larger; parts: in how many it filters it;
-    probed: what the DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a
-    scene's points have, or less.
+    noise_in_radii: an object's noise std in radii of its patches, before the first pass (a scene's are all shown in one
+    size, and d says as much); probed: what the DistanceModule said of patches of that pass, by number; usual: the
+    noise std that four fifths of a scene's points have, or less.
     """
 
     distance: float
@@ -39,6 +48,7 @@ class Reading:
     scene: bool
     zoom: float = 1.0
     parts: int = 1
+    noise_in_radii: float = 0.0
     probed: Mapping[int, float] = field(default_factory=dict)
     usual: float = 0.0
 
@@ -68,7 +78,9 @@ class NoiseReader:
             noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
             return Reading(distance, noise, scene, parts=parts, probed=known if parts == 1 else {}, usual=usual)
         noise = self._noise_std(distances, scales)
-        zoom, parts = 1.0, 1
+        zoom, parts, in_radii = 1.0, 1, 0.0
+        if first is None:
+            in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:
             if first is None:
                 noise = self._read_again(here, tiling, noise)
@@ -76,11 +88,11 @@ class NoiseReader:
             elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
                 zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
         if parts > 1:  # of other patches
-            return Reading(distance, noise, scene, zoom, parts)
+            return Reading(distance, noise, scene, zoom, parts, in_radii)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, zoom, 1, known)
+        return Reading(distance, noise, scene, zoom, 1, in_radii, known)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["LOUD_NOISE", "CloudFrame", "is_scene", "parts_of", "patch_scales", "zoom_of", "zoom_of_rest"]
+__all__ = ["LOUD_NOISE", "CloudFrame", "is_scene", "noise_in_radii", "parts_of", "patch_scales", "zoom_of", "zoom_of_rest"]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training.md says how they were measured).
@@ -91,6 +91,11 @@ def zoom_of_rest(noise_std: float, at_half_size: float) -> float:
     return float(np.clip(_SHOWN_REST / max(at_half_size, 1e-9), _SMALLEST_REST_ZOOM, 1.0))
 
 
+def noise_in_radii(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
+    """Return noise in radii of the median patch, both in one unit."""
+    return noise_std / max(float(np.median(radii)), 1e-9)
+
+
 def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> int:
     """Return in how many parts a pass filters `count` points, each by itself: 1 where patches reach far enough.
 
@@ -98,7 +103,7 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> in
     however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
     has patches of sqrt(m) times the radius, at the same cost (docs/training.md, "Parts").
     """
-    wanted = round(noise_std / max(float(np.median(radii)), 1e-9) / _NOISE_A_PART)
+    wanted = round(noise_in_radii(noise_std, radii) / _NOISE_A_PART)
     return max(1, min(wanted, _MOST_PARTS, count // _SMALLEST_PART))
 
 

@@ -27,6 +27,7 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
     "settled": tuple(
         (few, few, many, many) for few, many in product((0.14, 0.16, 0.18, 0.2, 0.22), (0.18, 0.2, 0.22, 0.25))
     ),
+    "crowded": (0.042, 1.0),
     "stirred": (0.5,),
     "most": (5,),
 }
@@ -39,7 +40,8 @@ NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0
 class Trace:
     """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on.
 
-    noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it.
+    noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it;
+    noise_in_radii: of a patch, what was read at the start.
     """
 
     cloud: str
@@ -47,6 +49,7 @@ class Trace:
     distances: tuple[float, ...]
     chamfer: tuple[float, ...]
     noise_type: str = "gaussian"
+    noise_in_radii: float = 0.0
 
     @property
     def level(self) -> tuple[str, str, float]:
@@ -63,23 +66,24 @@ def trace(
     noise_type: str = "gaussian",
 ) -> Trace:
     """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
-    states, distances = every_pass(filter_, noisy)
+    states, distances, in_radii = every_pass(filter_, noisy)
     chamfer = tuple(chamfer_distance(x, clean) for x in states)
-    return Trace(name, noise_std, distances, chamfer, noise_type)
+    return Trace(name, noise_std, distances, chamfer, noise_type, in_radii)
 
 
 def every_pass(
     filter_: Filter, noisy: npt.NDArray[np.float64], *, seed: int = 0
-) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...]]:
-    """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and d before each and after the last.
+) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...], float]:
+    """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and what it goes by.
 
-    As many passes as `calibrate` knows of.
+    That is d before each pass and after the last, and the noise at the start in radii of a patch. As many passes as
+    `calibrate` knows of.
     """
     run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"]), seed=seed))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
-    return list(states.values()), run.distances
+    return list(states.values()), run.distances, run.readings[0].noise_in_radii
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
@@ -130,7 +134,9 @@ def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:
 def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
-    while done + 1 < len(recorded.distances) and calibration.passes_left(recorded.distances[: done + 1]):
+    while done + 1 < len(recorded.distances):
+        if not calibration.passes_left(recorded.distances[: done + 1], recorded.noise_in_radii):
+            break
         done += 1
     return done
 

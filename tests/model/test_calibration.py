@@ -42,6 +42,15 @@ def test_a_cloud_gets_the_passes_that_its_distances_ask_for(distances: tuple[flo
     assert passes(Calibration(), trace(0.0, *distances)) == made
 
 
+def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> None:
+    distances = (0.58, 0.19, 0.12, 0.12, 0.12)
+    few, dense = Trace("few", 0.01, distances, ()), Trace("dense", 0.01, distances, (), noise_in_radii=0.06)
+    assert (passes(Calibration(), few), passes(Calibration(), dense)) == (2, 3)
+    assert passes(Calibration(), Trace("thin", 0.01, (0.58, 0.3, 0.3), (), noise_in_radii=0.06)) == 1
+    assert passes(Calibration(), Trace("clean", 0.0, (0.13, 0.12, 0.12), (), noise_in_radii=0.06)) == 1
+    assert passes(Calibration(crowded=1.0), dense) == 2
+
+
 def test_the_limits_are_those_under_which_recorded_clouds_end_best() -> None:
     smooth = [  # four passes are best, one more does harm
         Trace("smooth", 0.02, (0.87, 0.24, 0.15, 0.13, 0.12, 0.11), (9.0, 4.0, 3.0, 2.5, 2.0, 2.2)),
@@ -81,6 +90,7 @@ def test_a_trace_has_d_and_cd_before_each_pass_and_after_the_last() -> None:
     recorded = measured(load_filter(device="cpu", threads=1), "ball", clean, rough, 0.03, "laplace")
     assert (recorded.cloud, recorded.noise_std, recorded.noise_type) == ("ball", 0.03, "laplace")
     assert len(recorded.distances) == len(recorded.chamfer) == 6
+    assert recorded.noise_in_radii > 0
     assert recorded.chamfer[0] == pytest.approx(chamfer_distance(rough, clean))
     assert min(recorded.chamfer) < recorded.chamfer[0]
 
