@@ -38,6 +38,11 @@ COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RE
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
+# A row so many times as far out as half of the rows are is no point of the cloud: a file's sign for "no data". With it,
+# float64 would hold all others in one place.
+_FAR_OUT, _SOME = 1e12, 10_000
+# Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/training.md, "Few points").
+_FEW_POINTS = 500
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 
 
@@ -62,8 +67,8 @@ class DenoiseResult:
     """The filtered cloud and how it came about.
 
     xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
-    distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not
-    finite and passed through.
+    distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not finite,
+    or so far out that they can be no points, and passed through.
     """
 
     xyz: npt.NDArray[np.float64]
@@ -132,7 +137,7 @@ class Filter:
 
         even: between passes, points are spread along the surface (`spread`). zoom: passes show an object in the size of
         its noise, and in parts where that fills the patches (`NoiseReader`); a scene's points go no farther than it
-        and not along surfaces (`restraint`).
+        and, like others that lie by chance, not along surfaces (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """
@@ -211,12 +216,15 @@ class Run:
             raise TooFewPoints(f"points must be (N, 3), got {xyz.shape}")
         self.filter, self.options, self.xyz = owner, options, xyz
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        self.not_finite = len(xyz) - len(self.rows)
+        self.rows = self.rows[~_far_out(xyz[self.rows])]
+        self.far_out = len(xyz) - self.not_finite - len(self.rows)
         if len(self.rows) < MIN_POINTS:
-            untouched = len(xyz) - len(self.rows)
-            raise TooFewPoints(f"{len(self.rows)} points to filter ({untouched} not finite); at least {MIN_POINTS}")
-        finite = xyz if len(self.rows) == len(xyz) else xyz[self.rows]
-        self.frame = CloudFrame.of(finite)
-        self.points = _Distinct(finite)
+            others = f"{self.not_finite} not finite, {self.far_out} far out"
+            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
+        cloud = xyz if len(self.rows) == len(xyz) else xyz[self.rows]
+        self.frame = CloudFrame.of(cloud)
+        self.points = _Distinct(cloud)
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.readings: list[Reading] = []  # before each pass, and after the last
@@ -248,9 +256,14 @@ class Run:
         out = self.xyz.copy()
         out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
-        warnings = [f"{untouched} points are not finite and were passed through"] if untouched else []
+        warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
+        if self.far_out:
+            farther = f"more than {_FAR_OUT:.0e} times as far out as half of the others"
+            warnings.append(f"{self.far_out} points are {farther} and were passed through")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
+        elif len(self.points.xyz) < _FEW_POINTS:
+            warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
         noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
         return DenoiseResult(
             out, self.iterations, noise[0], noise[-1], self.distances, untouched, seconds, tuple(warnings)
@@ -264,6 +277,8 @@ class Run:
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
+        if len(self.points.xyz) < _FEW_POINTS:
+            return 1 - self.iterations
         return self.filter.calibration.passes_left(self.distances, self.readings[0].noise_in_radii)
 
     def _evened(
@@ -271,10 +286,10 @@ class Run:
     ) -> npt.NDArray[np.float64] | float:
         """Return how points go along the surface before the pass that comes, (N, 3); tiling: the last pass's.
 
-        Not before the first, nor in a scene: scan lines are no clumps. d is read of the points so spread, also where
-        no pass comes after.
+        Not before the first, nor where chance laid them, or a scanner: scan lines are no clumps. d is read of the
+        points so spread, also where no pass comes after.
         """
-        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].scene:
+        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].scattered:
             return 0.0
         return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
 
@@ -291,7 +306,9 @@ class Run:
                 owned = cut.owned_points(patch)
                 step = displacement / scales[patch]
                 if believed is not None:
-                    step = across(restrained(self.moved[owned], step, believed[patch]), here[cut.index[patch]])
+                    step = restrained(self.moved[owned], step, believed[patch])
+                if shown.scattered and self.filter.zoom:
+                    step = across(step, here[cut.index[patch]])
                 self.moved[owned] += step
                 settled += len(owned)
                 copies = self.points.copies(owned)
@@ -347,6 +364,21 @@ class _Distinct:
             return distinct.astype(np.int64)
         groups = [self._order[self._starts[d] : self._starts[d + 1]] for d in distinct]
         return np.concatenate(groups) if groups else distinct.astype(np.int64)
+
+
+def _far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
+    none = np.zeros(len(xyz), dtype=bool)
+    some = np.unique(xyz[:: max(1, len(xyz) // _SOME)], axis=0)  # where many rows say "no data", all say the same
+    if len(some) == 0:
+        return none
+    middle = np.median(some / 2, axis=0)  # halves: a difference may overflow
+    reach = np.median(np.abs(some / 2 - middle).max(axis=1))
+    ends = np.stack([xyz.min(axis=0), xyz.max(axis=0)]) / 2
+    if reach == 0 or np.abs(ends - middle).max() / _FAR_OUT <= reach:
+        return none
+    far: npt.NDArray[np.bool_] = np.abs(xyz / 2 - middle).max(axis=1) / _FAR_OUT > reach
+    return far
 
 
 def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:

@@ -20,6 +20,7 @@ from straightpcf.model.normalize import (
 )
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
+from straightpcf.model.spacing import is_scattered
 from straightpcf.model.tiles import Tiling, parted
 
 __all__ = ["NoiseReader", "Reading"]
@@ -37,15 +38,17 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; zoom: the factor by which the pass shows an object larger; parts: in how many it filters it;
-    noise_in_radii: an object's noise std in radii of its patches, before the first pass (a scene's are all shown in one
-    size, and d says as much); probed: what the DistanceModule said of patches of that pass, by number; usual: the
-    noise std that four fifths of a scene's points have, or less.
+    object seen whole; scattered: whether points lie on their surface by chance, as a scene's do; zoom: the factor by
+    which the pass shows an object larger; parts: in how many it filters it; noise_in_radii: an object's noise std in
+    radii of its patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what
+    the DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's
+    points have, or less.
     """
 
     distance: float
     noise_std: float
     scene: bool
+    scattered: bool
     zoom: float = 1.0
     parts: int = 1
     noise_in_radii: float = 0.0
@@ -76,9 +79,11 @@ class NoiseReader:
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         if scene:
             noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
-            return Reading(distance, noise, scene, parts=parts, probed=known if parts == 1 else {}, usual=usual)
+            probed = known if parts == 1 else {}
+            return Reading(distance, noise, scene, scattered=True, parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
         zoom, parts, in_radii = 1.0, 1, 0.0
+        scattered = is_scattered(here, probes, noise) if first is None else first.scattered
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:
@@ -88,11 +93,11 @@ class NoiseReader:
             elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
                 zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
         if parts > 1:  # of other patches
-            return Reading(distance, noise, scene, zoom, parts, in_radii)
+            return Reading(distance, noise, scene, scattered, zoom, parts, in_radii)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, zoom, 1, in_radii, known)
+        return Reading(distance, noise, scene, scattered, zoom, 1, in_radii, known)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""

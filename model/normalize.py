@@ -7,7 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["LOUD_NOISE", "CloudFrame", "is_scene", "noise_in_radii", "parts_of", "patch_scales", "zoom_of", "zoom_of_rest"]
+__all__ = [
+    "LOUD_NOISE",
+    "CloudFrame",
+    "is_scene",
+    "noise_in_radii",
+    "parts_of",
+    "patch_scales",
+    "zoom_of",
+    "zoom_of_rest",
+]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training.md says how they were measured).

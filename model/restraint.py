@@ -1,4 +1,7 @@
-"""How far the points of a scene may go, and where to: no farther than its noise reaches, and not along a surface."""
+"""How far the points of a scene may go, and where to: no farther than its noise reaches.
+
+And not along a surface, nor may those of an object that lie on it by chance.
+"""
 
 from __future__ import annotations
 
@@ -53,8 +56,9 @@ def restrained(
 def across(step: npt.NDArray[np.float64], around: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return a step (n, 3) without what goes along the surface, where there is one.
 
-    around: (P, 3), a patch, of which the first n points make the step. An object's points are spread evenly (`spread`);
-    a scene's lie as the scanner's beams fell, and to draw them together widens gaps and tears scan lines.
+    around: (P, 3), a patch, of which the first n points make the step. Points that lie evenly are spread so again
+    (`spread`); others lie as beams or chance have it (`is_scattered`): to draw them together widens gaps and tears scan
+    lines, and to spread them takes them away from where they were.
     """
     count = min(_AROUND, len(around))
     _, nearest = cKDTree(around).query(around[: len(step)], k=np.arange(1, count + 1))

@@ -80,6 +80,34 @@ def test_row_i_stays_row_i_and_invalid_rows_pass_through(tiny: Filter, count: in
     assert result.untouched == holes
 
 
+@pytest.mark.parametrize("far", [1e14, 1e30, 1.7e308])
+@pytest.mark.parametrize("count", [1, 2000])
+def test_rows_that_mean_no_data_pass_through_and_harm_no_other(tiny: Filter, far: float, count: int) -> None:
+    cloud = noisy(torus(1200), 0.01)
+    alone = tiny.denoise(cloud, ONE_PASS)
+    result = tiny.denoise(np.vstack([cloud, np.full((count, 3), far)]), ONE_PASS)
+    np.testing.assert_array_equal(result.xyz[:1200], alone.xyz)
+    assert (result.xyz[1200:] == far).all()
+    assert result.untouched == count
+    assert "1e+12 times as far out" in result.warnings[0]
+
+
+def test_rows_may_be_far_out_or_all_be_huge(tiny: Filter) -> None:
+    cloud = noisy(torus(1200), 0.01)
+    assert tiny.denoise(np.vstack([cloud, [[1e8, 0, 0]]]), ONE_PASS).untouched == 0
+    huge = tiny.denoise(cloud * 1e307, ONE_PASS)
+    assert huge.untouched == 0
+    assert np.isfinite(huge.xyz).all()
+
+
+def test_few_points_get_one_pass_of_auto_and_a_warning(shipped: Filter) -> None:
+    few = shipped.denoise(noisy(torus(300), 0.01))
+    assert few.iterations == 1
+    assert "300 points" in few.warnings[0]
+    assert shipped.denoise(noisy(torus(300), 0.01), DenoiseOptions(iterations=2)).iterations == 2
+    assert shipped.denoise(noisy(torus(600), 0.02)).warnings == ()
+
+
 def test_patches_add_up_to_the_result_whatever_the_thread_count(tiny: Filter) -> None:
     cloud = noisy(torus(3500), 0.01)
     options = DenoiseOptions(iterations=2)

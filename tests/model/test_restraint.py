@@ -101,4 +101,4 @@ def test_what_was_an_object_before_the_first_pass_stays_one() -> None:
     wide /= 300.0
     tiling = Tiling(wide, split(wide, 10_000), coverage=1.0, seed=0)
     assert run.reader.read(wide, tiling, None).scene
-    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False)).scene
+    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False, scattered=False)).scene

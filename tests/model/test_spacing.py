@@ -1,0 +1,52 @@
+"""Whether points lie on their surface evenly or by chance is told from how the room around them varies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.model.metrics import chamfer_distance
+from straightpcf.model.patches import cut_patches
+from straightpcf.model.spacing import is_scattered
+from tests.clouds import noisy, sphere, torus
+
+
+def even_sphere(count: int) -> np.ndarray:
+    """Spread (count, 3) points over the unit sphere along a golden spiral."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+def scattered(xyz: np.ndarray, noise_std: float) -> bool:
+    rough = noisy(xyz, noise_std)
+    return is_scattered(rough, cut_patches(rough, coverage=3.0, seed=0), noise_std)
+
+
+@pytest.mark.parametrize("count", [1000, 3000, 12_000])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_chance_is_told_from_evenness_while_noise_is_below_the_spacing(count: int, share: float) -> None:
+    spacing = np.sqrt(4 * np.pi / count)
+    assert scattered(sphere(count), share * spacing)
+    assert not scattered(even_sphere(count), share * spacing)
+
+
+def test_where_nothing_tells_points_are_taken_for_even() -> None:
+    assert not scattered(sphere(3000), 0.06)  # the spacing is 0.065
+    assert not scattered(sphere(99), 0.0)  # a third of which have the nearest 32 in common
+
+
+def test_as_many_points_in_one_place_are_no_error() -> None:
+    xyz = np.repeat(sphere(100), 20, axis=0)
+    assert is_scattered(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0) in (True, False)
+
+
+@pytest.mark.parametrize(("noise_std", "at_most"), [(0.0, 5e-6), (0.002, 2.2e-5), (0.01, 4e-4)])
+def test_points_that_lie_by_chance_end_nearer_to_where_they_were(noise_std: float, at_most: float) -> None:
+    clean = torus(3000)
+    rough = noisy(clean, noise_std)
+    before, after = chamfer_distance(rough, clean), chamfer_distance(load_filter(threads=2).denoise(rough).xyz, clean)
+    assert after < (before or at_most)
+    assert after < at_most
