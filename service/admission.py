@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from straightpcf.points.errors import QuotaExceeded, ServerBusy, SpoolFull, TooManyBytes
+from straightpcf.points.wire.patches import BYTES_PER_POINT
 from straightpcf.service.jobs.store import Load
 
 __all__ = ["Limits"]
+
+_AUTO_PASSES = 5  # the most that `auto` makes with the shipped weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +52,20 @@ class Limits:
                 f"{load.jobs} jobs of this key are waiting or running; it may have {self.max_jobs_per_key}"
             )
 
-    def check_disk(self, load: Load, free_bytes: int, *, size: int) -> None:
-        """Raise SpoolFull if an input of `size` bytes and a result as large do not fit."""
-        if load.bytes + 2 * size > self.max_spool_bytes:
-            raise SpoolFull(f"{load.bytes} bytes of jobs are kept; this server keeps {self.max_spool_bytes}")
-        if free_bytes - 2 * size < self.min_free_bytes:
-            raise SpoolFull(f"the server's disk has {free_bytes} bytes left; {self.min_free_bytes} must stay free")
+    def spool_bytes(self, size: int, *, weight: int = 0, iterations: int | Literal["auto"] = "auto") -> int:
+        """Say what a job's files may come to: `size` bytes of input, a result as large, patches of `weight` points."""
+        passes = _AUTO_PASSES if iterations == "auto" else iterations
+        return 2 * size + min(weight, self.max_points) * passes * BYTES_PER_POINT
+
+    def check_disk(self, load: Load, free_bytes: int, *, spool: int) -> None:
+        """Raise SpoolFull if a job of `spool` bytes does not fit beside those that are kept and are still to come."""
+        if load.bytes + spool > self.max_spool_bytes:
+            raise SpoolFull(
+                f"{load.bytes} bytes of jobs are kept or to come and up to {spool} would be added; "
+                f"this server keeps {self.max_spool_bytes}"
+            )
+        if free_bytes - load.coming - spool < self.min_free_bytes:
+            raise SpoolFull(
+                f"the server's disk has {free_bytes} bytes left, of which jobs may take {load.coming + spool}; "
+                f"{self.min_free_bytes} must stay free"
+            )

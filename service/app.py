@@ -161,11 +161,13 @@ def _check_start(settings: Settings) -> None:
         JobStore(settings.data_dir / "jobs.sqlite3").close()
     except (OSError, sqlite3.Error) as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
-    if settings.grpc_port:
-        try:
-            socket.create_server((settings.host, settings.grpc_port)).close()
-        except OSError as exc:
-            raise InvalidOptions(f"grpc_port is {settings.grpc_port}, which cannot be had: {exc}") from exc
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    for name in ("port", "grpc_port"):
+        if port := getattr(settings, name):
+            try:
+                socket.create_server((settings.host, port), family=family).close()
+            except OSError as exc:
+                raise InvalidOptions(f"{name} is {port}, which cannot be had: {exc}") from exc
 
 
 def _is_loopback(host: str) -> bool:

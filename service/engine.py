@@ -8,7 +8,7 @@ import json
 import logging
 import re
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
@@ -22,11 +22,12 @@ from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.jobs.folders import JobFolders, digest_of
+from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState
 from straightpcf.service.jobs.runner import JobRunner
-from straightpcf.service.jobs.store import JobStore, Load, NewJob
+from straightpcf.service.jobs.store import JobStore, NewJob
 
-__all__ = ["Engine", "JobRequest"]
+__all__ = ["Engine", "JobRequest", "Usage"]
 
 # Another server may work on a job of ours, and tells us nothing: readers look again after this.
 POLL_SECONDS = 1.0
@@ -54,6 +55,15 @@ class JobRequest:
     traceparent: str | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Usage:
+    """Sum up jobs: counts: by state; points: that wait or run, as estimated; bytes: of their files on the disk."""
+
+    counts: Mapping[str, int]
+    points: int
+    bytes: int
+
+
 class Engine:
     """Admit jobs, keep them safe, run them on a backend, and tell what becomes of them.
 
@@ -65,8 +75,6 @@ class Engine:
         self.backend = backend
         self.limits = limits
         self.draining = False
-        self.load = Load(jobs=0, points=0, bytes=0)  # as it was a moment ago
-        self.counts: dict[str, int] = {}  # jobs by state, likewise
         self._data_dir = data_dir
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="job-store")  # SQLite blocks, the event loop must not
         self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
@@ -84,7 +92,7 @@ class Engine:
         """Open the store, take back what dead servers left, and begin to start the backend; `ready` says when it is."""
         self._folders = await asyncio.to_thread(JobFolders, self._data_dir)
         self._store = await asyncio.get_running_loop().run_in_executor(
-            self._thread, JobStore, self._data_dir / "jobs.sqlite3"
+            self._thread, JobStore, self._data_dir / "jobs.sqlite3", self._folders.job_bytes
         )
         self._runner = JobRunner(
             self.backend, folders=self._folders, call=self._call, notify=self._notify,
@@ -123,9 +131,9 @@ class Engine:
         if self.backend.failure is not None:
             raise self.backend.failure
         self.limits.check_bytes(size)
-        self.load = await self._call(JobStore.load)
-        self.limits.check_queue(self.load)
-        self.limits.check_disk(self.load, self._folders.free_bytes(), size=size)
+        load = await self._call(JobStore.load)
+        self.limits.check_queue(load)
+        self.limits.check_disk(load, self._folders.free_bytes(), spool=self.limits.spool_bytes(size))
 
     def upload(self) -> AbstractContextManager[Path]:
         """Lend a file for a request's body; what is not submitted is removed."""
@@ -157,6 +165,7 @@ class Engine:
             options=request.options,
             bytes=size,
             weight=weight,
+            spool=self.limits.spool_bytes(size, weight=weight, iterations=request.options.iterations),
             digest=hashlib.sha256(json.dumps(said).encode()).hexdigest(),
             idempotency_key=request.idempotency_key,
             traceparent=request.traceparent,
@@ -170,10 +179,10 @@ class Engine:
     def _admit(self, store: JobStore, new: NewJob, source: Path) -> tuple[JobRecord, bool]:
         if (known := store.match(new)) is not None:
             return known, False
-        self.load = store.load()
-        self.limits.check_queue(self.load, weight=new.weight)
+        load = store.load()
+        self.limits.check_queue(load, weight=new.weight)
         self.limits.check_key(store.load(new.owner))
-        self.limits.check_disk(self.load, self._folders.free_bytes(), size=new.bytes)
+        self.limits.check_disk(load, self._folders.free_bytes(), spool=new.spool)
         created = False
         try:
             self._folders.adopt(source, new.folder)
@@ -184,6 +193,11 @@ class Engine:
                 self._folders.remove(new.folder)
 
     # --- telling about jobs
+
+    async def usage(self) -> Usage:
+        """Sum up every job as it is now."""
+        load, counts = await self._call(JobStore.load), await self._call(JobStore.counts)
+        return Usage(counts=counts, points=load.points, bytes=await asyncio.to_thread(self._folders.used_bytes))
 
     async def get(self, id: str, *, owner: str = "") -> JobRecord:
         """Return a job as it is."""
@@ -269,9 +283,13 @@ class Engine:
     # --- inside
 
     async def _call(self, function: Callable[Concatenate[JobStore, _P], _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        """Run one store transaction on the store's thread; it is carried out even if the caller is cancelled."""
+        """Run one store transaction on the store's thread; it is carried out even if the caller is cancelled.
+
+        Raises SpoolFull where the disk is full.
+        """
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._thread, lambda: function(self._store, *args, **kwargs))
+        with full_disk_as_spool_full():
+            return await loop.run_in_executor(self._thread, lambda: function(self._store, *args, **kwargs))
 
     def _news_of(self, id: str) -> asyncio.Event:
         """Return an event that is set at the next change; take it before looking, so that no change is missed."""
@@ -296,14 +314,13 @@ class Engine:
         """Take back what died, expire what is old, remove what nobody owns."""
         servers = await self._call(JobStore.servers)
         dead = await asyncio.to_thread(self._folders.dead_servers, servers - {self._folders.server})
-        for id in await self._call(JobStore.recover, dead):
-            logger.warning("job %s was left by a server that died; it is queued again", id)
+        for id in await self._call(JobStore.recover, dead, expires_in=self.limits.result_ttl_seconds):
+            logger.warning("nobody worked on job %s any more: a server died, or could not write", id)
             self._notify(id)
         gone = await self._call(JobStore.expire, rows_after=self.limits.row_ttl_seconds)
         gone += await self._call(JobStore.unknown, await asyncio.to_thread(self._folders.orphans))
         for folder in gone:
             await asyncio.to_thread(self._folders.remove, folder)
-        self.load, self.counts = await self._call(JobStore.load), await self._call(JobStore.counts)
 
 
 async def _first(news: asyncio.Event, seconds: float) -> None:

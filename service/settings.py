@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,11 @@ from straightpcf.points.options import MIN_TILE_POINTS
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
 ENVIRONMENT_PREFIX = "STRAIGHTPCF_"
-_OF_CLIENTS = frozenset({"STRAIGHTPCF_URL", "STRAIGHTPCF_KEY"})  # what the CLI's other commands read
+# What the CLI's other commands, the kernels and install.sh read.
+_OF_OTHERS = frozenset({f"{ENVIRONMENT_PREFIX}{name}" for name in ("URL", "KEY", "NO_KERNELS", "TORCH")})
+# What Kubernetes tells every pod of a Service whose name begins with straightpcf; PORT is a setting if it is a number.
+_SERVICE_LINK = re.compile(r"\w*_(SERVICE_(HOST|PORT\w*)|PORT_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?)")
+_SERVICE_URL = re.compile(r"(tcp|udp|sctp)://.+:\d+")
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
@@ -33,7 +38,7 @@ class Settings:
     max_bytes: of one request body.  max_points: of one cloud.
     max_jobs, max_queued_points: waiting and running at once, over all keys; more are answered "busy".
     max_jobs_per_key: waiting and running for one key.  rate_per_minute: requests of one key, 0 for any number.
-    max_spool_bytes: inputs and results on the disk.  min_free_bytes: what the disk must have left.
+    max_spool_bytes: inputs, results and patches on the disk, or to come.  min_free_bytes: what it must then have left.
     max_sync_seconds: how long POST /denoise waits before it answers 202.
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
@@ -84,17 +89,17 @@ class Settings:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
 
     def keys(self) -> tuple[str, ...]:
-        """Return the API keys; raises InvalidOptions where their file cannot be read or holds none."""
-        keys = [key.strip() for key in self.api_keys.split(",")]
+        """Return the API keys; raises InvalidOptions for a key that no header carries, and for a file without any."""
+        found = _usable_keys(self.api_keys.split(","), "api_keys")
         if self.api_keys_file is not None:
             try:
-                keys += [line.strip() for line in self.api_keys_file.read_text().splitlines()]
+                lines = self.api_keys_file.read_text().splitlines()
             except (OSError, UnicodeDecodeError) as exc:
                 raise InvalidOptions(f"api_keys_file {self.api_keys_file}: {exc}") from exc
-        found = tuple(dict.fromkeys(key for key in keys if key and not key.startswith("#")))
-        if self.api_keys_file is not None and not found:
-            raise InvalidOptions(f"api_keys_file {self.api_keys_file} holds no key")
-        return found
+            found += _usable_keys(lines, f"api_keys_file {self.api_keys_file}")
+            if not found:
+                raise InvalidOptions(f"api_keys_file {self.api_keys_file} holds no key")
+        return tuple(dict.fromkeys(found))
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str], **overrides: Any) -> Settings:
@@ -102,7 +107,7 @@ class Settings:
         kinds = {spec.name: str(spec.type) for spec in dataclasses.fields(cls)}
         values: dict[str, Any] = {}
         for variable, text in environment.items():
-            if not variable.startswith(ENVIRONMENT_PREFIX) or variable in _OF_CLIENTS:
+            if not variable.startswith(ENVIRONMENT_PREFIX) or _is_of_others(variable, text):
                 continue
             name = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
             if name not in kinds:
@@ -110,6 +115,21 @@ class Settings:
             values[name] = _parse(variable, kinds[name], text)
         values |= {name: value for name, value in overrides.items() if value is not None}
         return cls(**values)
+
+
+def _is_of_others(variable: str, text: str) -> bool:
+    if variable in _OF_OTHERS or _SERVICE_LINK.fullmatch(variable):
+        return True
+    return variable.endswith("_PORT") and _SERVICE_URL.fullmatch(text) is not None
+
+
+def _usable_keys(texts: Iterable[str], setting: str) -> list[str]:
+    """Leave out blanks and comments; the error must not tell the key, for it ends in a log."""
+    keys = [key for key in map(str.strip, texts) if key and not key.startswith("#")]
+    for number, key in enumerate(keys, 1):
+        if not (key.isascii() and key.isprintable()):
+            raise InvalidOptions(f"{setting}: key {number} of {len(keys)} is not printable ASCII; no header carries it")
+    return keys
 
 
 def _parse(variable: str, kind: str, text: str) -> Any:

@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from straightpcf.service.engine import Engine
+from straightpcf.service.engine import Engine, Usage
 from straightpcf.service.jobs.record import STATES
 
 __all__ = ["MetricsMiddleware", "Telemetry"]
@@ -33,26 +33,33 @@ class Telemetry:
         self.grpc_requests = Counter(
             "straightpcf_grpc_requests", "Calls answered.", ("method", "status"), registry=self.registry
         )
-        self.registry.register(_EngineCollector(engine))
+        self._engine = _EngineCollector(engine)
+        self.registry.register(self._engine)
 
     async def endpoint(self, request: Request) -> Response:
         """Answer GET /metrics."""
+        await self._engine.look()
         return Response(generate_latest(self.registry), media_type=CONTENT_TYPE_LATEST)
 
 
 class _EngineCollector(Collector):
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self._usage = Usage(counts={}, points=0, bytes=0)
+
+    async def look(self) -> None:
+        """Ask what `collect`, which may not wait, then tells."""
+        self._usage = await self._engine.usage()
 
     def collect(self) -> Iterable[Metric]:
-        engine = self._engine
+        engine, usage = self._engine, self._usage
         jobs = GaugeMetricFamily("straightpcf_jobs", "Jobs in the store by state.", labels=["state"])
         for state in STATES:
-            jobs.add_metric([state], engine.counts.get(state, 0))
+            jobs.add_metric([state], usage.counts.get(state, 0))
         yield jobs
         for name, text, value in (
-            ("queue_points", "Points that wait or run, as estimated when they came.", engine.load.points),
-            ("spool_bytes", "Bytes of inputs and results that are kept.", engine.load.bytes),
+            ("queue_points", "Points that wait or run, as estimated when they came.", usage.points),
+            ("spool_bytes", "Bytes of inputs, results and patches on the disk.", usage.bytes),
             ("ready", "1 while a worker is warm and nothing drains.", int(engine.ready)),
             ("workers", "Workers that are warm.", len(engine.backend.devices)),
             ("worker_restarts", "Workers that died and were replaced.", engine.backend.restarts),

@@ -11,7 +11,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,10 +77,12 @@ class RunningServer:
 
 
 @contextmanager
-def run_server(folder: Path, *arguments: str, environment: Mapping[str, str] | None = None) -> Iterator[RunningServer]:
-    """Start a server, wait until it listens, and end it politely."""
+def run_server(
+    folder: Path, *arguments: str, environment: Mapping[str, str] | None = None, within: Sequence[str] = ()
+) -> Iterator[RunningServer]:
+    """Start a server, wait until it listens, and end it politely; within: a command that runs the rest of its line."""
     log = folder / "server.log"
-    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--device", "cpu"]
+    command = [*within, sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--device", "cpu"]
     command += ["--data-dir", str(folder / "data"), *arguments]
     with log.open("wb") as sink:
         settings = clean_environment() | dict(environment or {})

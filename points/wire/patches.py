@@ -10,14 +10,22 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["PATCHES_MEDIA_TYPE", "PatchFrame", "PatchReader", "encode_end", "encode_frame", "encode_header"]
+__all__ = [
+    "BYTES_PER_POINT",
+    "PATCHES_MEDIA_TYPE",
+    "PatchFrame",
+    "PatchReader",
+    "encode_end",
+    "encode_frame",
+    "encode_header",
+]
 
 PATCHES_MEDIA_TYPE = "application/vnd.straightpcf.patches"
 _MAGIC, _VERSION = b"SPCP", 1
 _HEADER = struct.Struct("<4sHHQ")
 _FRAME = struct.Struct("<IHHfI")  # length of what follows it, iteration, flags, progress, n
 _FINAL, _END = 1, 2
-_BYTES_PER_POINT = 4 + 3 * 8
+BYTES_PER_POINT = 4 + 3 * 8  # of each pass
 _MAX_FRAME_POINTS = 2**24  # a frame is one patch; more is not a frame
 
 
@@ -58,7 +66,7 @@ def _frame(
     indices: npt.NDArray[np.integer], xyz: npt.NDArray[np.float64], iteration: int, flags: int, progress: float
 ) -> bytes:
     count = len(indices)
-    length = _FRAME.size - 4 + count * _BYTES_PER_POINT
+    length = _FRAME.size - 4 + count * BYTES_PER_POINT
     head = _FRAME.pack(length, iteration, flags, progress, count)
     return b"".join([head, indices.astype("<u4").tobytes(), xyz.astype("<f8").tobytes()])
 
@@ -83,7 +91,7 @@ class PatchReader:
         frames, at = [], 0
         while len(self._buffer) - at >= _FRAME.size:
             length, iteration, flags, progress, count = _FRAME.unpack_from(self._buffer, at)
-            if count > _MAX_FRAME_POINTS or length != _FRAME.size - 4 + count * _BYTES_PER_POINT:
+            if count > _MAX_FRAME_POINTS or length != _FRAME.size - 4 + count * BYTES_PER_POINT:
                 raise MalformedFile(f"a patch frame of {count} points cannot have {length} bytes")
             if len(self._buffer) - at < 4 + length:
                 break

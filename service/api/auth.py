@@ -5,14 +5,20 @@ from __future__ import annotations
 import hashlib
 import hmac
 import time
+from typing import Annotated
 
-from fastapi import Request
+from fastapi import Depends, Request
+from fastapi.security import HTTPBearer
 
 from straightpcf.points.errors import RateLimited, Unauthorized
 
 __all__ = ["Gate", "owner_of"]
 
 _SECONDS = 60.0
+# Says so in the OpenAPI document; it is the gate that checks.
+_BEARER = HTTPBearer(
+    scheme_name="key", description="An API key of this server; one without keys asks for none.", auto_error=False
+)
 
 
 class Gate:
@@ -57,7 +63,7 @@ class Gate:
             raise RateLimited(f"this key may send {self._rate} requests a minute")
 
 
-def owner_of(request: Request) -> str:
+def owner_of(request: Request, _: Annotated[object, Depends(_BEARER)]) -> str:
     """Return who asks, as a FastAPI dependency."""
     gate: Gate = request.app.state.gate
     return gate.admit(request.headers.get("authorization"))

@@ -13,6 +13,7 @@ from starlette.requests import Request
 
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.service.admission import Limits
+from straightpcf.service.api.disposition import disposition_name
 
 __all__ = ["SpoolFile", "Upload", "declared_size", "receive_upload"]
 
@@ -58,8 +59,7 @@ async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Up
         limits.check_bytes(received := received + len(chunk))
         spool.buffer += chunk
         await spool.flush(above=WRITE_BYTES)
-    _, options = parse_options_header(request.headers.get("content-disposition"))
-    return Upload(name=_text(options[b"filename"]) if b"filename" in options else None)
+    return Upload(name=disposition_name(request.headers.get("content-disposition", "")))
 
 
 async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, limits: Limits) -> Upload:
@@ -135,7 +135,7 @@ class _Form:
             if self.has_file:
                 raise InvalidRequest(f'the form has more than one file in "{FILE_FIELD}"; send one cloud a request')
             self.has_file = True
-            self.upload.name = _text(options[b"filename"]) if b"filename" in options else None
+            self.upload.name = disposition_name(self._disposition.decode("latin-1"))
             self._sink = self._file
         else:
             self._sink = bytearray()

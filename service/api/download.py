@@ -16,26 +16,32 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 
 from straightpcf.points.errors import RangeNotSatisfiable
+from straightpcf.service.api.errors import problem_response
 from straightpcf.service.jobs.record import JobRecord
 
 __all__ = ["report_and_file", "result_response"]
 
-_RANGES = re.compile(r"bytes=\s*(\d+-\d*|-\d+)(\s*,\s*(\d+-\d*|-\d+))*\s*")
+_RANGE = re.compile(r"(\d{1,18})-(\d{0,18})|()-(\d{1,18})")  # no file needs more digits
+_CONDITIONAL = frozenset({"GET", "HEAD"})  # what another method made or did is sent whole
 _CHUNK_BYTES = 2**18
 
 
 def result_response(
     request: Request, path: Path, record: JobRecord, *, after: BackgroundTask | None = None
 ) -> Response:
-    """Send a job's result, or the part of it that was asked for; `after` runs when it is sent.
-
-    Raises RangeNotSatisfiable.
-    """
+    """Send a job's result, or the part of it that a GET asks for; `after` runs when it is sent."""
     assert record.result is not None
-    headers = {**result_headers(record), "Accept-Ranges": "bytes"}
-    if _matches(request.headers.get("if-none-match"), headers["ETag"]):
-        return Response(status_code=304, headers={"ETag": headers["ETag"]}, background=after)
-    _check_range(request, record.result.bytes)
+    headers, size = {**result_headers(record), "Accept-Ranges": "bytes"}, record.result.bytes
+    parts: list[str] = []
+    if request.method in _CONDITIONAL:
+        if _matches(request.headers.get("if-none-match"), headers["ETag"]):
+            return Response(status_code=304, headers={"ETag": headers["ETag"]}, background=after)
+        asked = _ranges(request, headers["ETag"])
+        parts = [f"{first}-{last}" for first, last in asked if (int(first) < size if first else int(last) > 0)]
+        if asked and not parts:
+            error = RangeNotSatisfiable(f"{request.headers['range'][:60]!r} is outside the {size} bytes of the result")
+            return problem_response(request, error, 416, headers={"Content-Range": f"bytes */{size}"})
+    _leave_ranges(request, parts)
     return FileResponse(
         path, filename=record.result.filename, media_type=record.result.media_type, headers=headers, background=after
     )
@@ -88,19 +94,24 @@ def _matches(if_none_match: str | None, etag: str) -> bool:
     return "*" in tags or etag in tags
 
 
-def _check_range(request: Request, size: int) -> None:
-    """Raise RangeNotSatisfiable where no byte is in reach; a malformed Range is ignored (RFC 9110, 14.2)."""
-    wanted = request.headers.get("range")
-    if wanted is None:
-        return
-    if not _RANGES.fullmatch(wanted):
-        request.scope["headers"] = [pair for pair in request.scope["headers"] if pair[0] != b"range"]
-        return
-    if request.headers.get("if-range") is not None:
-        return
-    starts = [part.strip().split("-") for part in wanted.removeprefix("bytes=").split(",")]
-    if not any((int(first) < size if first else int(last) > 0) for first, last in starts):
-        raise RangeNotSatisfiable(f"range {wanted[:60]!r} is outside the {size} bytes of the result")
+def _ranges(request: Request, etag: str) -> list[tuple[str, str]]:
+    """Return each first-last that is asked for, one of which may be empty; none where the whole result is due.
+
+    It is where If-Range names another result, and where a Range is malformed (RFC 9110, 13.1.5 and 14.2).
+    """
+    unit, _, listed = request.headers.get("range", "").partition("=")
+    if unit.lower() != "bytes" or request.headers.get("if-range", etag) != etag:
+        return []
+    found = [_RANGE.fullmatch(part.strip()) for part in listed.split(",")]
+    ranges = [(match[1] or "", match[2] or match[4] or "") for match in found if match]
+    backwards = any(first and last and int(first) > int(last) for first, last in ranges)
+    return [] if backwards or len(ranges) < len(found) else ranges
+
+
+def _leave_ranges(request: Request, parts: list[str]) -> None:
+    """Let FileResponse, which reads the headers for itself and more strictly, see these ranges only."""
+    headers = [pair for pair in request.scope["headers"] if pair[0] not in (b"range", b"if-range")]
+    request.scope["headers"] = headers + ([(b"range", f"bytes={','.join(parts)}".encode())] if parts else [])
 
 
 def _number(value: float | None) -> str:

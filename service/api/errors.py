@@ -10,6 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from straightpcf.points.errors import InternalError, InvalidRequest, MethodNotAllowed, NotFound, StraightPCFError
 from straightpcf.service.api.request_id import HEADER, request_id
@@ -21,6 +22,7 @@ __all__ = [
     "RETRY_AFTER_SECONDS",
     "STATUS_BY_CODE",
     "install_error_handlers",
+    "problem_response",
 ]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
@@ -90,6 +92,7 @@ GRPC_STATUS_BY_CODE: Mapping[str, str] = {
 }
 
 _KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
+_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 
 
 def install_error_handlers(app: FastAPI) -> None:
@@ -103,20 +106,32 @@ def install_error_handlers(app: FastAPI) -> None:
 
 async def _ours(request: Request, error: Exception) -> Response:
     assert isinstance(error, StraightPCFError)
-    return _problem(request, error, STATUS_BY_CODE[error.code])
+    return problem_response(request, error, STATUS_BY_CODE[error.code])
 
 
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     path = f"{request.method} {request.url.path[:200]}"
     kind = _KINDS.get(error.status_code, InvalidRequest if error.status_code < 500 else InternalError)
-    return _problem(request, kind(f"{error.detail}: {path}"), error.status_code, headers=error.headers)
+    # Starlette names the methods of the first route that has the path; another route may have more.
+    headers = {"Allow": ", ".join(_methods(request))} if error.status_code == 405 else error.headers
+    return problem_response(request, kind(f"{error.detail}: {path}"), error.status_code, headers=headers)
+
+
+def _methods(request: Request) -> list[str]:
+    """Return the methods that a request's path takes."""
+    routes = request.app.routes
+    return [
+        method
+        for method in _METHODS
+        if any(route.matches({**request.scope, "method": method})[0] is Match.FULL for route in routes)
+    ]
 
 
 async def _validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     faults = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
-    return _problem(request, InvalidRequest(faults), 422)
+    return problem_response(request, InvalidRequest(faults), 422)
 
 
 async def _nobody_listens(request: Request, error: Exception) -> Response:
@@ -125,12 +140,13 @@ async def _nobody_listens(request: Request, error: Exception) -> Response:
 
 async def _unforeseen(request: Request, error: Exception) -> Response:
     # Its message may hold paths or contents: the log has it, under this request's id.
-    return _problem(request, InternalError("the server met an error of its own"), 500)
+    return problem_response(request, InternalError("the server met an error of its own"), 500)
 
 
-def _problem(
+def problem_response(
     request: Request, error: StraightPCFError, status: int, *, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
+    """Answer with an error; `headers` are what its status asks for beside the usual."""
     problem = Problem(
         type=f"urn:straightpcf:error:{error.code}",
         title=HTTPStatus(status).phrase,

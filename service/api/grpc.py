@@ -43,6 +43,7 @@ SERVICE = pb.DESCRIPTOR.services_by_name["DenoiseService"].full_name
 CHUNK_BYTES = 2**18
 WRITE_BYTES = 2**20
 HEALTH_SECONDS = 0.25
+MAX_EVENT_ID = 999_999_999  # as in REST
 _OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
@@ -132,6 +133,8 @@ class DenoiseService(stubs.DenoiseServiceServicer):
         """Work on one file while its caller listens."""
         async with self._answering(context, "Denoise") as caller:
             config = (await _first(requests)).config
+            # Nobody else knows such a job: it lives as long as its call.
+            private = not config.job.id and caller.idempotency_key is None
             record, _ = await self._take(config.job, requests, caller, endpoint="denoise")
             try:
                 await context.write(pb.DenoiseResponse(accepted=_job(record)))
@@ -147,7 +150,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                         await context.write(pb.DenoiseResponse(chunk=chunk))
                 await context.write(pb.DenoiseResponse(summary=_job(record)))
             finally:
-                if caller.idempotency_key is None:  # nobody else knows this job
+                if private:
                     await asyncio.shield(self._engine.delete(record.id, owner=record.owner))
 
     async def CreateJob(  # noqa: N802
@@ -184,6 +187,8 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     async def WatchJob(self, request: pb.WatchJobRequest, context: Context) -> None:  # noqa: N802
         """Send events until the job is finished."""
         async with self._answering(context, "WatchJob") as caller:
+            if request.after > MAX_EVENT_ID:
+                raise InvalidRequest(f"after is {request.after}; it must be the id of an event")
             async for event in self._engine.events(request.id, owner=caller.owner, after=request.after):
                 record = None
                 if event.kind == "completed":

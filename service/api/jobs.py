@@ -57,6 +57,7 @@ async def put_job(id: str, request: Request, owner: Owner) -> Response:
     return job_response(record, 202 if created else 200)
 
 
+@router.head("/jobs", include_in_schema=False)
 @router.get("/jobs", response_model=JobPage, responses=problems(400, 401), summary="List jobs")
 async def list_jobs(
     request: Request,
@@ -71,6 +72,7 @@ async def list_jobs(
     return JobPage(jobs=[Job.of(record) for record in records], next_cursor=next_cursor)
 
 
+@router.head("/jobs/{id}", include_in_schema=False)
 @router.get("/jobs/{id}", response_model=Job, responses=problems(400, 401, 404), summary="Look at a job")
 async def get_job(
     id: str,
@@ -99,7 +101,7 @@ async def job_events(
 
 @router.post(
     "/jobs/{id}/cancel", status_code=202, response_model=Job, summary="Cancel a job",
-    responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 404)},
+    responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 404, 507)},
 )  # fmt: skip
 async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
     """Cancel a job that waits or runs; its worker is free within a second."""
@@ -109,7 +111,7 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
     return job_response(after, 200 if before.finished else 202)
 
 
-@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 404), summary="Delete a job")
+@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 404, 507), summary="Delete a job")
 async def delete_job(id: str, request: Request, owner: Owner) -> None:
     """Remove a job, its files and its events, whatever its state."""
     engine: Engine = request.app.state.engine
@@ -128,6 +130,7 @@ router.get("/jobs/{id}/result", summary="Fetch the result", operation_id="get_re
 router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="head_result", **_RESULT)(_result)
 
 
+@router.head("/jobs/{id}/report", include_in_schema=False)
 @router.get("/jobs/{id}/report", response_model=Report, responses=problems(401, 404, 409, 410), summary="The report")
 async def job_report(id: str, request: Request, owner: Owner) -> Report:
     """Show displacement, noise before and after, passes, timings and warnings."""

@@ -157,8 +157,8 @@ _PROBLEMS = {
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
     415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
     416: "No byte of the result is in the range (`range_not_satisfiable`).",
-    422: "An option, a key or the cloud is unusable (`invalid_options`, `malformed_file`, `too_few_points`, "
-    "`invalid_cloud`, `unsupported_cloud`, `idempotency_conflict`).",
+    422: "A parameter, an option, a key or the cloud is unusable (`invalid_request`, `invalid_options`, "
+    "`malformed_file`, `too_few_points`, `invalid_cloud`, `unsupported_cloud`, `idempotency_conflict`).",
     429: "This key has too many requests or jobs (`rate_limited`, `quota_exceeded`); see Retry-After.",
     500: "A fault of the server (`internal_error`).",
     503: "Try again after Retry-After (`server_busy`), or no device (`device_unavailable`).",

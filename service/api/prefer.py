@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 __all__ = ["Preference", "parse_prefer"]
@@ -19,11 +20,11 @@ class Preference:
         """Tell whether there is any preference."""
         return self.respond_async or self.wait is not None
 
-    def applied(self) -> dict[str, str]:
-        """Return the Preference-Applied header."""
-        said = (["respond-async"] if self.respond_async else []) + (
-            [] if self.wait is None else [f"wait={self.wait:g}"]
-        )
+    def applied(self, *, finished: bool, longest: float = math.inf) -> dict[str, str]:
+        """Return the Preference-Applied header: what was heeded by an answer that waited `longest` seconds at most."""
+        said = ["respond-async"] if self.respond_async and not finished else []
+        if self.wait is not None and (finished or self.wait <= longest):
+            said.append(f"wait={self.wait:.0f}")
         return {"Preference-Applied": ", ".join(said)} if said else {}
 
 

@@ -21,6 +21,7 @@ from straightpcf.service.api.openapi import (
     DENOISE_PARAMETERS,
     DENOISE_RESPONSES,
     PATH_PARAMETER,
+    problems,
 )
 from straightpcf.service.api.prefer import parse_prefer
 from straightpcf.service.api.schemas import Health, Info
@@ -55,41 +56,47 @@ async def denoise(request: Request, owner: Owner) -> Response:
 
     Send a form with the cloud in the field `file`, or the cloud itself as the body and the options in the query
     string. Every field of the file but the positions comes back unchanged. The request waits for the result; with
-    `Prefer: respond-async` or after `Prefer: wait=N` it answers 202 and the job, and with `Accept: text/event-stream`
-    the events of the job.
+    `Prefer: respond-async` or after `Prefer: wait=N` (or both: then the wait comes first) it answers 202 and the job,
+    and with `Accept: text/event-stream` the events of the job.
     """
     engine: Engine = request.app.state.engine
     prefer = parse_prefer(request.headers.getlist("prefer"))
     record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
     if SSE_MEDIA_TYPE in request.headers.get("accept", ""):
         return event_stream(engine, record.id, owner, headers={"Location": f"/jobs/{record.id}"})
-    if prefer.respond_async:
-        return job_response(record, 202, prefer.applied())
+    if prefer.respond_async and prefer.wait is None:
+        return job_response(record, 202, prefer.applied(finished=False))
     # Nobody else knows the id of such a job: it lives as long as its request.
     private = not prefer.stated and "idempotency-key" not in request.headers
-    longest = (
-        engine.limits.max_sync_seconds if prefer.wait is None else min(prefer.wait, engine.limits.max_sync_seconds)
-    )
+    longest = engine.limits.max_sync_seconds
+    seconds = longest if prefer.wait is None else min(prefer.wait, longest)
     try:
-        record = await _wait_while_connected(engine, request, record, longest)
+        record = await _wait_while_connected(engine, request, record, seconds)
     except ClientDisconnect:
         if private:
             await engine.delete(record.id, owner=owner)
         raise
+    applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
-        return job_response(record, 202, prefer.applied())
+        return job_response(record, 202, applied)
     cleanup = BackgroundTask(engine.delete, record.id, owner=owner) if private else None
     try:
         path, record = await engine.result(record.id, owner=owner)
         if flag(fields, "report"):
-            return report_and_file(path, record, after=cleanup)
-        return result_response(request, path, record, after=cleanup)
+            answer: Response = report_and_file(path, record, after=cleanup)
+        else:
+            answer = result_response(request, path, record, after=cleanup)
+        answer.headers.update(applied)
+        return answer
     except Exception:
         if private:
             await engine.delete(record.id, owner=owner)
         raise
 
 
+# Load balancers ask with HEAD.
+@router.head("/healthz", include_in_schema=False)
+@router.head("/livez", include_in_schema=False)
 @router.get("/healthz", summary="Is the server there")
 @router.get("/livez", summary="Is the server there", operation_id="livez")
 async def health(request: Request) -> Health:
@@ -97,16 +104,18 @@ async def health(request: Request) -> Health:
     return Health(status="ok", ready=request.app.state.engine.ready)
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", summary="Is a worker warm", response_model=Health, responses={503: {"model": Health}})
 async def ready(request: Request) -> JSONResponse:
-    """Answer 200 once the weights are loaded and a first cloud went through them, 503 before and while draining."""
+    """Answer 200 once the weights are loaded and a first cloud went through them, 503 before, and once it drains."""
     engine: Engine = request.app.state.engine
     status = "ok" if engine.ready else "draining" if engine.draining else "starting"
     health = Health(status=status, ready=engine.ready)
     return JSONResponse(health.model_dump(), status_code=200 if engine.ready else 503)
 
 
-@router.get("/v1/info", summary="Version, limits, formats, devices")
+@router.head("/v1/info", include_in_schema=False)
+@router.get("/v1/info", summary="Version, limits, formats, devices", responses=problems(401))
 async def info(request: Request, owner: Owner) -> Info:
     """Say what this server is and takes."""
     return Info.of(request.app.state.engine, weights=request.app.state.weights)

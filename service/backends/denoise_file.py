@@ -51,7 +51,9 @@ def denoise_file(
     was_read = time.monotonic()
     run = Run(denoiser, cloud.xyz, job.options)
     with ExitStack() as open_files:
-        patches = None if job.patches is None else open_files.enter_context(_PatchFile(job.patches, len(cloud)))
+        patches = None if job.patches is None else open_files.enter_context(_PatchFile(job.patches))
+        if patches is not None:
+            patches.write(encode_header(len(cloud)))
         preview = _Preview(len(cloud), on_preview)
         for patch in run.patches():
             if patches is not None:
@@ -94,9 +96,8 @@ def denoise_file(
 class _PatchFile:
     """Append frames, each whole and at once, so that a reader can follow the file."""
 
-    def __init__(self, path: Path, points: int) -> None:
+    def __init__(self, path: Path) -> None:
         self._file: IO[bytes] = path.open("wb", buffering=0)
-        self.write(encode_header(points))
 
     def __enter__(self) -> _PatchFile:
         return self
@@ -105,7 +106,9 @@ class _PatchFile:
         self._file.close()
 
     def write(self, frame: bytes) -> None:
-        self._file.write(frame)
+        left = memoryview(frame)
+        while left:  # a disk that is nearly full takes a part, and then raises
+            left = left[self._file.write(left) :]
 
 
 class _Preview:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import signal
 import time
@@ -11,10 +10,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from straightpcf.points.errors import InternalError, JobCanceled, SpoolFull, StraightPCFError, TooLarge
+from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
+from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 
 if TYPE_CHECKING:
     from straightpcf.model.filter import Filter
@@ -142,7 +142,8 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
         pipe.send(Preview(job.id, iteration, indices, xyz))
 
     try:
-        return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview))
+        with full_disk_as_spool_full():
+            return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview))
     except (EOFError, BrokenPipeError):
         raise
     except Exception as error:
@@ -152,8 +153,6 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
 def _failure(job_id: str, error: Exception) -> Failed:
     if isinstance(error, StraightPCFError):
         return Failed(job_id, error.code, error.message)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return Failed(job_id, SpoolFull.code, "the server's disk has no room for the result")
     logger.exception("the worker met an error of no kind of ours")
     if isinstance(error, MemoryError):
         return Failed(job_id, TooLarge.code, "the cloud does not fit in this server's memory")

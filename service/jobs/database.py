@@ -28,5 +28,8 @@ def open_database(path: Path) -> sqlite3.Connection:
     columns = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
     if "deaths" not in columns:  # before versions were counted
         db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
+    if "spool" not in columns:  # likewise
+        db.execute("ALTER TABLE jobs ADD COLUMN spool INTEGER NOT NULL DEFAULT 0")
+        db.execute("UPDATE jobs SET spool = bytes + IFNULL(json_extract(result, '$.bytes'), 0)")
     db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
     return db

@@ -14,6 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
+
 __all__ = ["INPUT", "JobFolders", "digest_of"]
 
 INPUT = "input"
@@ -38,13 +40,17 @@ class JobFolders:
 
     @contextmanager
     def upload(self) -> Iterator[Path]:
-        """Lend the path of a file to be; whatever is still there at the end is removed."""
-        handle, name = tempfile.mkstemp(dir=self._incoming)
-        os.close(handle)
-        try:
-            yield Path(name)
-        finally:
-            Path(name).unlink(missing_ok=True)
+        """Lend the path of a file to be; whatever is still there at the end is removed.
+
+        Raises SpoolFull where the disk is full, also while the file is filled.
+        """
+        with full_disk_as_spool_full():
+            handle, name = tempfile.mkstemp(dir=self._incoming)
+            os.close(handle)
+            try:
+                yield Path(name)
+            finally:
+                Path(name).unlink(missing_ok=True)
 
     def path(self, folder: str) -> Path:
         """Return where a job's folder is."""
@@ -63,6 +69,14 @@ class JobFolders:
     def remove(self, folder: str) -> None:
         """Remove a job's files."""
         shutil.rmtree(self.path(folder), ignore_errors=True)
+
+    def job_bytes(self, folder: str) -> int:
+        """Return how large a job's files are."""
+        return _bytes_in(self.path(folder))
+
+    def used_bytes(self) -> int:
+        """Return how large the files of all jobs are, and of all uploads on their way in."""
+        return _bytes_in(self._jobs) + _bytes_in(self._incoming)
 
     def free_bytes(self) -> int:
         """Return how much room the disk has."""
@@ -106,6 +120,15 @@ def digest_of(path: Path) -> str:
     """Return a file's sha256 in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _bytes_in(folder: Path) -> int:
+    size = 0
+    for at, _, names in os.walk(folder):  # which passes over a folder that is removed meanwhile
+        for name in names:
+            with suppress(FileNotFoundError):
+                size += Path(at, name).stat().st_size
+    return size
 
 
 def _sync(folder: Path) -> None:

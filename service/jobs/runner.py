@@ -44,7 +44,7 @@ class JobRunner:
     ) -> None:  # fmt: skip
         self._backend, self._folders, self._call, self._notify = backend, folders, call, notify
         self._max_points, self._ttl = max_points, result_ttl_seconds
-        self._running: dict[str, _Running] = {}
+        self._running: set[_Running] = set()
         self._work = asyncio.Event()
         self._loops: list[asyncio.Task[None]] = []
         self._stopping = False
@@ -60,15 +60,15 @@ class JobRunner:
 
     async def cancel(self, id: str) -> None:
         """Stop working on a job, if this server does."""
-        if (running := self._running.get(id)) is not None:
+        for running in [running for running in self._running if running.claim.record.id == id]:
             await running.end("canceled")
 
     async def stop(self, *, patience_seconds: float) -> None:
         """Take nothing more, let what runs finish for a while, and put back what did not."""
         self._stopping = True
-        if tasks := [running.task for running in self._running.values()]:
-            await asyncio.wait(tasks, timeout=patience_seconds)
-        await asyncio.gather(*(running.end("shutdown") for running in list(self._running.values())))
+        if self._running:
+            await asyncio.wait([running.over for running in self._running], timeout=patience_seconds)
+        await asyncio.gather(*(running.end("shutdown") for running in self._running))
         for loop in self._loops:
             loop.cancel()
         await asyncio.gather(*self._loops, return_exceptions=True)
@@ -77,26 +77,29 @@ class JobRunner:
         while not self._stopping:
             try:
                 await self._backend.wait_idle()
-                self._work.clear()
-                claim = await self._call(JobStore.claim, self._folders.server, LEASE_SECONDS)
-                if claim is None:
-                    await self._wait_for_work()
-                    continue
-                running = _Running(asyncio.create_task(self._run(claim)))
-                self._running[claim.record.id] = running
-                try:
-                    await asyncio.wait([running.task])
-                finally:
-                    del self._running[claim.record.id]
-                    self._notify(claim.record.id)
-                if not running.task.cancelled() and (fault := running.task.exception()) is not None:
-                    raise fault
             except StraightPCFError as failure:  # no worker will ever start
                 logger.error("no more jobs are run here: %s", failure)
                 return
+            try:
+                await self._serve_one()
             except Exception:
                 logger.exception("a job could not be written down; its lease will run out")
                 await asyncio.sleep(POLL_SECONDS)
+
+    async def _serve_one(self) -> None:
+        self._work.clear()
+        claim = await self._call(JobStore.claim, self._folders.server, LEASE_SECONDS)
+        if claim is None:
+            await self._wait_for_work()
+            return
+        running = _Running(claim, asyncio.create_task(self._compute(claim)))
+        self._running.add(running)
+        try:
+            await self._settle(running)
+        finally:
+            self._running.discard(running)
+            running.over.set_result(None)
+            self._notify(claim.record.id)
 
     async def _wait_for_work(self) -> None:
         try:
@@ -108,83 +111,103 @@ class JobRunner:
     async def _beat(self) -> None:
         while True:
             await asyncio.sleep(HEARTBEAT_SECONDS)
-            if not self._running:
+            tended = list(self._running)
+            if not tended:
                 continue
-            try:
-                held, canceled = await self._call(JobStore.extend, self._folders.server, LEASE_SECONDS)
+            try:  # of these alone: the lease of a job whose end could not be written must run out
+                held = [(running.claim.record.id, running.claim.fence) for running in tended]
+                holds = await self._call(JobStore.extend, held, LEASE_SECONDS)
             except Exception:
                 logger.exception("the leases could not be renewed; another try follows")
                 continue
-            for id, running in list(self._running.items()):
-                if id in canceled or id not in held:
-                    await running.end("canceled" if id in canceled else "lost")
+            for running, hold in zip(tended, holds, strict=True):
+                if hold != "held":
+                    await running.end(hold)
 
-    async def _run(self, claim: Claim) -> None:
-        record, fence = claim.record, claim.fence
+    async def _compute(self, claim: Claim) -> FileReport:
+        record = claim.record
         folder = self._folders.path(record.folder)
-        target = folder / f"result-{record.attempts}"  # an attempt that comes back from the dead harms no later one
         log = _Log(claim, self._call, self._notify)
         try:
-            try:
-                report = await self._backend.run(
-                    FileJob(
-                        id=record.id,
-                        source=folder / INPUT,
-                        target=target,
-                        options=record.options,
-                        max_points=self._max_points,
-                        name=record.name,
-                        format=record.format,
-                        patches=folder / f"patches-{record.attempts}",
-                    ),
-                    log,
-                )
-            finally:
-                await log.close()
-            result = _result_info(record.name, report)
-            logger.info(
-                "job %s: %d points, %d passes on %s, %.2f s%s", record.id, report.points, report.iterations,
-                report.device, report.seconds, _trace(record.traceparent),
-            )  # fmt: skip
-            await self._call(
-                JobStore.succeed, record.id, fence, result=result, report=_report(report), file=target.name,
-                expires_in=self._ttl,
-            )  # fmt: skip
-        except WorkerDied as death:
-            await self._after_death(claim, death)
-        except StraightPCFError as error:
-            logger.info("job %s: %s: %s%s", record.id, error.code, error.message, _trace(record.traceparent))
-            await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
-        except asyncio.CancelledError:
-            reason = self._running[record.id].reason
-            if reason == "canceled":
-                canceled = JobCanceled(f"job {record.id} was canceled")
-                await self._call(JobStore.fail, record.id, fence, canceled, expires_in=self._ttl)
-            elif reason == "shutdown":
-                await self._call(JobStore.release, record.id, fence, "the server shut down; the job starts again")
+            return await self._backend.run(
+                FileJob(
+                    id=record.id,
+                    source=folder / INPUT,
+                    target=folder / _target(claim),
+                    options=record.options,
+                    max_points=self._max_points,
+                    name=record.name,
+                    format=record.format,
+                    patches=folder / f"patches-{record.attempts}",
+                ),
+                log,
+            )
+        finally:
+            await log.close()
+
+    async def _settle(self, running: _Running) -> None:
+        """Wait for a job's end and write it down; not in its task, which may be cancelled before it has begun."""
+        await asyncio.wait([running.task])
+        claim = running.claim
+        if running.task.cancelled():
+            await self._after_cancel(claim, running.reason)
+            return
+        match running.task.exception():
+            case None:
+                await self._deliver(claim, running.task.result())
+            case WorkerDied() as death:
+                await self._after_death(claim, death)
+            case StraightPCFError() as error:
+                logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
+                await self._fail(claim, error)
+            case fault:
+                raise fault
+
+    async def _deliver(self, claim: Claim, report: FileReport) -> None:
+        record = claim.record
+        logger.info(
+            "job %s: %d points, %d passes on %s, %.2f s%s", record.id, report.points, report.iterations,
+            report.device, report.seconds, _trace(claim),
+        )  # fmt: skip
+        await self._call(
+            JobStore.succeed, record.id, claim.fence, result=_result_info(record.name, report),
+            report=_report(report), file=_target(claim), expires_in=self._ttl,
+        )  # fmt: skip
+
+    async def _after_cancel(self, claim: Claim, reason: Reason | None) -> None:
+        if reason == "canceled":
+            await self._fail(claim, JobCanceled(f"job {claim.record.id} was canceled"))
+        elif reason == "shutdown":
+            await self._release(claim, "the server shut down; the job starts again")
 
     async def _after_death(self, claim: Claim, death: WorkerDied) -> None:
-        record, fence = claim.record, claim.fence
         logger.warning("%s (the job's death %d of %d)", death, claim.deaths + 1, MAX_DEATHS)
         if claim.deaths + 1 < MAX_DEATHS:
-            await self._call(JobStore.release, record.id, fence, "its worker died; the job starts again", died=True)
+            await self._release(claim, "its worker died; the job starts again", died=True)
         else:
             error = InternalError(f"the worker died {MAX_DEATHS} times on this cloud, which was then given up")
-            await self._call(JobStore.fail, record.id, fence, error, expires_in=self._ttl)
+            await self._fail(claim, error)
+
+    async def _fail(self, claim: Claim, error: StraightPCFError) -> None:
+        await self._call(JobStore.fail, claim.record.id, claim.fence, error, expires_in=self._ttl)
+
+    async def _release(self, claim: Claim, message: str, *, died: bool = False) -> None:
+        await self._call(JobStore.release, claim.record.id, claim.fence, message, expires_in=self._ttl, died=died)
 
 
 class _Running:
-    """Hold one job's task and why it was ended early."""
+    """Hold one job's task, why it was ended early, and, as `over`, that nothing more is written about it here."""
 
-    def __init__(self, task: asyncio.Task[None]) -> None:
-        self.task = task
+    def __init__(self, claim: Claim, task: asyncio.Task[FileReport]) -> None:
+        self.claim, self.task = claim, task
+        self.over: asyncio.Future[None] = task.get_loop().create_future()
         self.reason: Reason | None = None
 
     async def end(self, reason: Reason) -> None:
         if self.reason is None and not self.task.done():
             self.reason = reason
             self.task.cancel()
-        await asyncio.wait([self.task])
+        await asyncio.wait([self.over])
 
 
 class _Log:
@@ -223,11 +246,20 @@ class _Log:
     async def _write(self) -> None:
         while (told := await self._told.get()) is not None:
             function, args, kwargs = told
-            await self._call(function, self._id, self._fence, *args, **kwargs)
+            try:
+                await self._call(function, self._id, self._fence, *args, **kwargs)
+            except Exception as fault:  # the disk may be full by now and have room at the job's end
+                logger.warning("job %s: what its worker told could not be written down: %r", self._id, fault)
             self._notify(self._id)
 
 
-def _trace(traceparent: str | None) -> str:
+def _target(claim: Claim) -> str:
+    """Name an attempt's own result: one that comes back from the dead harms no later one."""
+    return f"result-{claim.record.attempts}"
+
+
+def _trace(claim: Claim) -> str:
+    traceparent = claim.record.traceparent
     return "" if traceparent is None else f" [traceparent {traceparent[:64]!r}]"
 
 

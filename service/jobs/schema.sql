@@ -9,6 +9,7 @@ CREATE TABLE IF NOT EXISTS jobs (
   options TEXT NOT NULL,
   bytes INTEGER NOT NULL,
   weight INTEGER NOT NULL,            -- points, as estimated before the file is read: what admission counts
+  spool INTEGER NOT NULL DEFAULT 0,   -- bytes of its files: while it is not finished, what they may come to
   points INTEGER,
   progress REAL NOT NULL DEFAULT 0,
   attempts INTEGER NOT NULL DEFAULT 0,

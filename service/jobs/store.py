@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from straightpcf.points.errors import (
     ERRORS_BY_CODE,
@@ -42,12 +42,15 @@ __all__ = ["JobStore", "Load", "NewJob"]
 
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+Hold = Literal["held", "canceled", "lost"]
 _PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewJob:
-    """Describe a job to be; weight: its points, estimated; digest: of the whole request."""
+    """Describe a job to be; weight: its points, estimated; spool: bytes that its files may come to; digest: of the
+    whole request.
+    """
 
     id: str
     owner: str
@@ -57,6 +60,7 @@ class NewJob:
     options: DenoiseOptions
     bytes: int
     weight: int
+    spool: int
     digest: str
     idempotency_key: str | None = None
     traceparent: str | None = None
@@ -64,18 +68,25 @@ class NewJob:
 
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """Sum up unfinished jobs and what lies on the disk: jobs and estimated points that wait or run, bytes kept."""
+    """Sum up jobs: those that wait or run, their estimated points, and bytes of files.
+
+    bytes: of all that are kept, with what the unfinished ones may come to. coming: of the latter, beside their inputs.
+    """
 
     jobs: int
     points: int
     bytes: int
+    coming: int
 
 
 class JobStore:
-    """Keep jobs and their events; use from one thread."""
+    """Keep jobs and their events; use from one thread.
 
-    def __init__(self, path: Path) -> None:
-        self._db = open_database(path)
+    bytes_of: how large the files in a folder are, asked at its job's end.
+    """
+
+    def __init__(self, path: Path, bytes_of: Callable[[str], int] = lambda folder: 0) -> None:
+        self._db, self._bytes_of = open_database(path), bytes_of
 
     def close(self) -> None:
         """Close the file."""
@@ -93,10 +104,10 @@ class JobStore:
                 return self._record(known), False
             now = time.time()
             self._db.execute(
-                "INSERT INTO jobs (id, owner, folder, state, name, format, options, bytes, weight, created_at,"
-                " traceparent, idempotency_key, digest) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO jobs (id, owner, folder, state, name, format, options, bytes, weight, spool, created_at,"
+                " traceparent, idempotency_key, digest) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (job.id, job.owner, job.folder, job.name, job.format, json.dumps(asdict(job.options)), job.bytes,
-                 job.weight, now, job.traceparent, job.idempotency_key, job.digest),
+                 job.weight, job.spool, now, job.traceparent, job.idempotency_key, job.digest),
             )  # fmt: skip
             record = self._record(self._row(job.id))
             self._add_event(job.id, "queued", {"position": record.position})
@@ -144,8 +155,7 @@ class JobStore:
         with self._transaction():
             row = self._row(id)
             if row["state"] == "queued":
-                error = {"code": "job_canceled", "detail": f"job {id} was canceled"}
-                self._end(id, "canceled", error=error, expires_in=expires_in)
+                self._end(id, "canceled", error=_canceled(id), expires_in=expires_in)
             elif row["state"] in _WORKING:
                 self._db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (id,))
             return self._record(self._row(id))
@@ -156,16 +166,13 @@ class JobStore:
             self._db.execute("DELETE FROM jobs WHERE id = ?", (id,))
 
     def load(self, owner: str | None = None) -> Load:
-        """Sum up what waits and runs, for one owner or for all, and the bytes of all inputs and results."""
+        """Sum up what waits and runs and what is kept, for one owner or for all."""
         where, values = ("", []) if owner is None else ("AND owner = ?", [owner])
-        query = f"SELECT COUNT(*), TOTAL(weight) FROM jobs WHERE state IN {_ACTIVE} {where}"
-        jobs, points = self._db.execute(query, values).fetchone()
-        query = (
-            "SELECT TOTAL(bytes + IFNULL(json_extract(result, '$.bytes'), 0)) FROM jobs WHERE state <> 'expired' "
-            + where
-        )
+        query = f"SELECT COUNT(*), TOTAL(weight), TOTAL(spool - bytes) FROM jobs WHERE state IN {_ACTIVE} {where}"
+        jobs, points, coming = self._db.execute(query, values).fetchone()
+        query = f"SELECT TOTAL(spool) FROM jobs WHERE state <> 'expired' {where}"
         (kept,) = self._db.execute(query, values).fetchone()
-        return Load(jobs=jobs, points=int(points), bytes=int(kept))
+        return Load(jobs=jobs, points=int(points), bytes=int(kept), coming=int(coming))
 
     def counts(self) -> dict[str, int]:
         """Count jobs by state."""
@@ -185,15 +192,14 @@ class JobStore:
             ).fetchone()
             return None if row is None else Claim(record=self._record(row), fence=row["fence"], deaths=row["deaths"])
 
-    def extend(self, server: str, lease_seconds: float) -> tuple[set[str], set[str]]:
-        """Renew the leases of a server; return the ids it still holds, and those of them that should be canceled."""
+    def extend(self, held: Sequence[tuple[str, int]], lease_seconds: float) -> list[Hold]:
+        """Renew leases, given as ids and fences; say of each whether it holds, "canceled" if its job should be."""
+        until, holds = time.time() + lease_seconds, list[Hold]()
         with self._transaction():
-            rows = self._db.execute(
-                f"UPDATE jobs SET lease_until = ? WHERE server = ? AND state IN {_WORKING}"
-                " RETURNING id, cancel_requested",
-                (time.time() + lease_seconds, server),
-            ).fetchall()
-        return {row["id"] for row in rows}, {row["id"] for row in rows if row["cancel_requested"]}
+            for id, fence in held:
+                mine = self._update(id, fence, "lease_until = ?", until)
+                holds.append("lost" if not mine else "canceled" if self._row(id)["cancel_requested"] else "held")
+        return holds
 
     def begin(self, id: str, fence: int, *, device: str) -> bool:
         """Tell that a worker has begun; False if the fence is old."""
@@ -241,17 +247,20 @@ class JobStore:
             self._end(id, state, error={"code": error.code, "detail": error.message}, expires_in=expires_in)
             return True
 
-    def release(self, id: str, fence: int, message: str, *, died: bool = False) -> bool:
-        """Put a job back into its place in the queue; died: it killed its worker, as far as one can tell."""
+    def release(self, id: str, fence: int, message: str, *, expires_in: float, died: bool = False) -> bool:
+        """Put a job back into its place in the queue, or end it if it is to be canceled.
+
+        died: it killed its worker, as far as one can tell.
+        """
         with self._transaction():
             set_ = "state = 'queued', server = NULL, lease_until = NULL, progress = 0, deaths = deaths + ?"
             mine = self._update(id, fence, set_, int(died))
             if mine:
-                self._requeued(id, message)
+                self._requeued(id, message, expires_in)
             return mine
 
-    def recover(self, dead_servers: Collection[str] = ()) -> list[str]:
-        """Put back the jobs whose lease ran out, or whose server is known to be dead; return their ids."""
+    def recover(self, dead_servers: Collection[str] = (), *, expires_in: float) -> list[str]:
+        """Release the jobs whose lease ran out, or whose server is known to be dead; return their ids."""
         with self._transaction():
             rows = self._db.execute(
                 f"UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0, fence = fence + 1"
@@ -260,7 +269,7 @@ class JobStore:
                 (time.time(), *dead_servers),
             ).fetchall()
             for row in rows:
-                self._requeued(row["id"], "its server died; the job starts again")
+                self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
 
     def expire(self, *, rows_after: float) -> list[str]:
@@ -295,10 +304,11 @@ class JobStore:
         self._db.execute("BEGIN IMMEDIATE")
         try:
             yield
+            self._db.execute("COMMIT")
         except BaseException:
-            self._db.execute("ROLLBACK")
+            if self._db.in_transaction:  # a full disk may have ended it
+                self._db.execute("ROLLBACK")
             raise
-        self._db.execute("COMMIT")
 
     def _known(self, job: NewJob) -> sqlite3.Row | None:
         if job.idempotency_key is not None:
@@ -328,13 +338,17 @@ class JobStore:
     def _end(self, id: str, state: JobState, *, error: dict[str, str] | None = None, expires_in: float = 0.0) -> None:
         now = time.time()
         self._db.execute(
-            "UPDATE jobs SET state = ?, error = ?, finished_at = ?, expires_at = ?, lease_until = NULL, server = NULL"
-            " WHERE id = ?",
-            (state, None if error is None else json.dumps(error), now, now + expires_in, id),
-        )
+            "UPDATE jobs SET state = ?, error = ?, finished_at = ?, expires_at = ?, spool = ?, lease_until = NULL,"
+            " server = NULL WHERE id = ?",
+            (state, None if error is None else json.dumps(error), now, now + expires_in,
+             self._bytes_of(self._row(id)["folder"]), id),
+        )  # fmt: skip
         self._add_event(id, "completed", {"state": state})
 
-    def _requeued(self, id: str, message: str) -> None:
+    def _requeued(self, id: str, message: str, expires_in: float) -> None:
+        if self._row(id)["cancel_requested"]:
+            self._end(id, "canceled", error=_canceled(id), expires_in=expires_in)
+            return
         self._add_event(id, "log", {"level": "warning", "message": message})
         self._add_event(id, "queued", {"position": self._record(self._row(id)).position})
 
@@ -368,6 +382,10 @@ class JobStore:
 
 def _error(saved: dict[str, str]) -> StraightPCFError:
     return ERRORS_BY_CODE.get(saved["code"], InternalError)(saved["detail"])
+
+
+def _canceled(id: str) -> dict[str, str]:
+    return {"code": "job_canceled", "detail": f"job {id} was canceled"}
 
 
 def _finished() -> str:

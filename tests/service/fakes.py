@@ -41,7 +41,10 @@ class Deaf:
 
 
 class ObedientBackend:
-    """Start every job once `go` is set and end it, as `outcomes` say or well, once `finish` is set."""
+    """Start every job once `go` is set and end it, as `outcomes` say or well, once `finish` is set.
+
+    patches: what a job that ends well has written beside its result.
+    """
 
     def __init__(self, *outcomes: StraightPCFError | WorkerDied) -> None:
         self.devices: tuple[str, ...] = ("cpu",)
@@ -49,6 +52,7 @@ class ObedientBackend:
         self.failure: StraightPCFError | None = None
         self.outcomes = list(outcomes)
         self.go, self.finish = asyncio.Event(), asyncio.Event()
+        self.patches = b""
         self.runs: list[FileJob] = []
         self.canceled: list[str] = []
 
@@ -74,4 +78,6 @@ class ObedientBackend:
         if self.outcomes:
             raise self.outcomes.pop(0)
         job.target.write_bytes(CONTENT)
+        if job.patches is not None:
+            job.patches.write_bytes(self.patches)
         return REPORT

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -143,7 +144,9 @@ def test_an_error_says_its_code_and_the_request(stub: Any) -> None:
     assert (status, info.reason) == ("INVALID_ARGUMENT", "INVALID_OPTIONS")
 
 
-@pytest.mark.parametrize("name", ["no config", "nothing", "config twice", "bad state", "bad offset", "bad wait"])
+@pytest.mark.parametrize(
+    "name", ["no config", "nothing", "config twice", "bad state", "bad offset", "bad wait", "bad after"]
+)
 def test_a_call_against_the_contract_is_refused(stub: Any, name: str) -> None:
     chunk, config = pb.CreateJobRequest(chunk=SMALL), pb.CreateJobRequest(config=pb.JobConfig())
     calls: dict[str, Callable[[], Any]] = {
@@ -152,6 +155,7 @@ def test_a_call_against_the_contract_is_refused(stub: Any, name: str) -> None:
         "config twice": lambda: stub.CreateJob(iter([config, config])),
         "bad state": lambda: stub.ListJobs(pb.ListJobsRequest(states=[77])),  # type: ignore[list-item]
         "bad offset": lambda: list(stub.DownloadResult(pb.DownloadResultRequest(id=done(stub), offset=10**9))),
+        "bad after": lambda: list(stub.WatchJob(pb.WatchJobRequest(id="x", after=2**63))),
         "bad wait": lambda: stub.GetJob(pb.GetJobRequest(id="x", wait_seconds=float("nan"))),
     }
     status, info = error_of(calls[name])
@@ -165,6 +169,20 @@ def done(stub: Any) -> str:
     config = pb.JobConfig(filename="cloud.npy", options=pb.DenoiseOptions(iterations=1))
     job = stub.CreateJob(parts(pb.CreateJobRequest, config, SMALL))
     return str(stub.GetJob(pb.GetJobRequest(id=job.id, wait_seconds=60)).id)
+
+
+def test_callers_who_choose_the_same_id_get_the_same_result(server: RunningServer, stub: Any) -> None:
+    job = pb.JobConfig(id="ours", filename="cloud.npy", options=pb.DenoiseOptions(iterations=1))
+
+    def summary(_: int) -> Any:
+        config = pb.DenoiseConfig(job=job, return_file=True)
+        return list(stub.Denoise(parts(pb.DenoiseRequest, config, SMALL)))[-1].summary
+
+    with ThreadPoolExecutor(3) as callers:
+        summaries = [*callers.map(summary, range(3)), summary(3)]  # the last comes when the others have gone
+    assert (summaries[0].state, summaries[0].attempts) == (pb.JOB_STATE_SUCCEEDED, 1)
+    assert summaries == [summaries[0]] * 4
+    stub.DeleteJob(pb.DeleteJobRequest(id="ours"))
 
 
 @pytest.mark.parametrize("ending", ["cancel", "deadline"])

@@ -243,6 +243,66 @@ def test_wrong_paths_and_methods_are_problems_too(server: RunningServer, method:
     assert answer.problem()["status"] == status
 
 
+@pytest.mark.parametrize(
+    ("path", "allow"),
+    [
+        ("/jobs", "GET, HEAD, POST"),
+        ("/jobs/some", "GET, HEAD, PUT, DELETE"),
+        ("/denoise", "POST, PUT"),
+        ("/readyz", "GET, HEAD"),
+        ("/jobs/some/cancel", "POST"),
+        ("/", "GET, HEAD"),
+    ],
+)
+def test_a_wrong_method_is_told_every_right_one(server: RunningServer, path: str, allow: str) -> None:
+    answer = curl("-X", "PATCH", f"{server.url}{path}")
+    assert answer.problem()["code"] == "method_not_allowed"
+    assert answer.headers["allow"] == allow
+
+
+def test_head_answers_as_get_does_without_the_body(server: RunningServer) -> None:
+    with httpx2.Client(base_url=server.url) as client:
+        for path in ("/livez", "/healthz", "/readyz", "/jobs", "/v1/info", "/", "/jobs/nope"):
+            get, head = client.get(path), client.head(path)
+            assert (head.status_code, head.content) == (get.status_code, b""), path
+            assert head.headers["content-type"] == get.headers["content-type"]
+            assert head.headers["content-length"] == get.headers["content-length"]
+
+
+@pytest.mark.parametrize("path", ["/jobs?limit=0", "/jobs?state=foo", "/jobs/some?wait=nan"])
+def test_a_query_parameter_that_cannot_be_read_is_422(server: RunningServer, path: str) -> None:
+    problem = curl(f"{server.url}{path}").problem()
+    assert (problem["status"], problem["code"]) == (422, "invalid_request")
+
+
+@pytest.mark.parametrize(
+    ("disposition", "name"),
+    [
+        ("attachment; filename*=UTF-8''%E2%98%83.npy", "%E2%98%83_clean.npy"),
+        ("attachment; filename=\"plain.npy\"; filename*=utf-8'en'%e2%98%83.npy", "%E2%98%83_clean.npy"),
+        ("attachment; filename*=iso-8859-1''caf%E9.npy; filename=plain.npy", "caf%C3%A9_clean.npy"),
+        ("attachment; filename*=UTF-8''..%2F..%2Fetc%2Fscan.npy", "scan_clean.npy"),
+        ("attachment; filename=\"a; filename*=UTF-8''b.npy\"", "a%3B%20filename%2A%3DUTF-8%27%27b_clean.npy"),
+        ("attachment; filename*=UTF-8''; filename=plain.npy", "plain_clean.npy"),
+    ],
+)
+def test_a_body_is_called_what_its_content_disposition_says(
+    server: RunningServer, cloud: Path, disposition: str, name: str
+) -> None:
+    said = f"Content-Disposition: {disposition}"
+    answer = curl("--data-binary", f"@{cloud}", "-H", said, f"{server.url}/denoise?iterations=1")
+    plain, extended = f'attachment; filename="{name}"', f"attachment; filename*=utf-8''{name}"
+    assert answer.headers["content-disposition"] == (extended if "%" in name else plain)
+
+
+def test_a_form_part_may_say_its_name_in_the_extended_way(server: RunningServer, cloud: Path) -> None:
+    head = b"--b\r\nContent-Disposition: form-data; name=\"file\"; filename*=UTF-8''%E2%98%83.npy\r\n\r\n"
+    body = head + cloud.read_bytes() + b"\r\n--b--\r\n"
+    kind = "Content-Type: multipart/form-data; boundary=b"
+    answer = curl("--data-binary", "@-", "-H", kind, f"{server.url}/denoise?iterations=1", stdin=body)
+    assert answer.headers["content-disposition"] == "attachment; filename*=utf-8''%E2%98%83_clean.npy"
+
+
 def _raw(server: RunningServer, request: bytes) -> Answer:
     """Send these bytes and nothing more; read until the server is done."""
     host, port = server.url.removeprefix("http://").split(":")
@@ -379,6 +439,17 @@ def test_the_openapi_document_has_examples_and_problems(server: RunningServer) -
             names = [(each["name"], each["in"]) for each in operation.get("parameters", [])]
             assert len(names) == len(set(names))
             assert ("{filename}" in path) == (("filename", "path") in names)
+
+
+def test_the_openapi_document_says_where_a_key_is_wanted(server: RunningServer) -> None:
+    document = json.loads(curl(f"{server.url}/openapi.json").body)
+    scheme = document["components"]["securitySchemes"]["key"]
+    assert (scheme["type"], scheme["scheme"]) == ("http", "bearer")
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            is_open = path in ("/livez", "/healthz", "/readyz")
+            assert ("401" in operation["responses"]) is not is_open, path
+            assert operation.get("security") == (None if is_open else [{"key": []}]), path
 
 
 def test_info_says_what_the_server_takes(strict_server: RunningServer) -> None:

@@ -180,6 +180,18 @@ def test_prefer_respond_async_and_wait_give_the_job_instead_of_a_timeout(http: h
     assert done.status_code == 200
 
 
+def test_respond_async_with_a_wait_waits_first_and_what_was_heeded_is_said(http: httpx2.Client) -> None:
+    began = time.monotonic()
+    late = http.post("/denoise?iterations=1", content=LARGE, headers={"Prefer": "respond-async, wait=1"})
+    assert (late.status_code, late.headers["preference-applied"]) == (202, "respond-async, wait=1")
+    assert time.monotonic() - began >= 1
+    assert http.delete(late.headers["location"]).status_code == 204
+    for query in ("", "&report=true"):
+        for prefer in ("wait=60", "respond-async, wait=60"):
+            done = http.post(f"/denoise?iterations=1{query}", content=SMALL, headers={"Prefer": prefer})
+            assert (done.status_code, done.headers["preference-applied"]) == (200, "wait=60")
+
+
 def test_denoise_tells_its_events_and_its_report_on_the_same_response(http: httpx2.Client) -> None:
     with http.stream("POST", "/denoise?iterations=1", content=SMALL, headers={"Accept": "text/event-stream"}) as answer:
         events = sse(answer.iter_lines())
@@ -252,6 +264,20 @@ def test_metrics_count_jobs_and_requests_by_route(http: httpx2.Client) -> None:
     assert "straightpcf_jobs{" in text
 
 
+def test_metrics_tell_what_is_there_now(server: RunningServer, http: httpx2.Client) -> None:
+    def metric(name: str) -> float:
+        (line,) = [line for line in http.get("/metrics").text.splitlines() if line.startswith(f"{name} ")]
+        return float(line.rpartition(" ")[2])
+
+    succeeded, spool = 'straightpcf_jobs{state="succeeded"}', "straightpcf_spool_bytes"
+    server.delete_jobs()
+    assert (metric(succeeded), metric(spool)) == (0, 0)
+    job = finished(http, make(http)["id"])
+    assert metric(succeeded) == 1
+    assert metric(spool) == sum(path.stat().st_size for path in server.spooled_files())
+    assert metric(spool) > len(SMALL) + job["result"]["bytes"]  # and its patches
+
+
 def test_a_key_sees_its_own_jobs_alone(tmp_path: Path) -> None:
     (tmp_path / "keys").write_text("# the team\nalpha\nbeta\n")
     with run_server(tmp_path, environment={"STRAIGHTPCF_API_KEYS_FILE": str(tmp_path / "keys")}) as server:
@@ -269,6 +295,8 @@ def test_a_key_sees_its_own_jobs_alone(tmp_path: Path) -> None:
             assert http.delete(f"/jobs/{id}", headers=beta).status_code == 404
             assert http.get("/jobs", headers=beta).json()["jobs"] == []
             assert {http.get(path).status_code for path in ("/livez", "/healthz", "/readyz")} == {200}
+            assert {http.get(path).status_code for path in ("/", "/openapi.json", "/docs", "/redoc")} == {200}
+            assert {http.get(path).status_code for path in ("/v1/info", "/metrics", "/jobs")} == {401}
         assert "alpha" not in server.log.read_text()
 
 

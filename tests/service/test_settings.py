@@ -1,11 +1,38 @@
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
 
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.service.settings import Settings
+from tests.conftest import clean_environment, run_server
+
+# What a pod is told of the Services straightpcf and straightpcf-grpc in its namespace.
+KUBERNETES = {
+    "STRAIGHTPCF_SERVICE_HOST": "10.0.0.1",
+    "STRAIGHTPCF_SERVICE_PORT": "8000",
+    "STRAIGHTPCF_SERVICE_PORT_HTTP": "8000",
+    "STRAIGHTPCF_PORT": "tcp://10.0.0.1:8000",
+    "STRAIGHTPCF_PORT_8000_TCP": "tcp://10.0.0.1:8000",
+    "STRAIGHTPCF_PORT_8000_TCP_PROTO": "tcp",
+    "STRAIGHTPCF_PORT_8000_TCP_PORT": "8000",
+    "STRAIGHTPCF_PORT_8000_TCP_ADDR": "10.0.0.1",
+    "STRAIGHTPCF_GRPC_SERVICE_HOST": "10.0.0.2",
+    "STRAIGHTPCF_GRPC_SERVICE_PORT": "50051",
+    "STRAIGHTPCF_GRPC_PORT": "tcp://[fd00::2]:50051",
+    "STRAIGHTPCF_GRPC_PORT_50051_TCP": "tcp://[fd00::2]:50051",
+}
+OF_OTHERS = {
+    "STRAIGHTPCF_URL": "http://127.0.0.1:8000",
+    "STRAIGHTPCF_KEY": "alpha",
+    "STRAIGHTPCF_NO_KERNELS": "1",
+    "STRAIGHTPCF_TORCH": "cpu",
+}
 
 
 def test_every_setting_is_read_from_the_environment() -> None:
@@ -34,11 +61,55 @@ def test_an_argument_wins_over_the_environment_and_none_does_not() -> None:
     assert (settings.port, settings.host) == (1, "::1")
 
 
+def test_what_kubernetes_and_our_other_programs_are_told_is_no_setting() -> None:
+    assert Settings.from_environment(KUBERNETES | OF_OTHERS) == Settings()
+
+
+def test_a_server_starts_beside_a_service_of_its_own_name(tmp_path: Path) -> None:
+    with (
+        run_server(tmp_path, environment=KUBERNETES | OF_OTHERS) as server,
+        urllib.request.urlopen(f"{server.url}/livez") as answer,
+    ):
+        assert answer.status == 200
+
+
+@pytest.mark.parametrize("key", ["clé", "кл\u044eч", "a\x01b"])
+def test_a_key_that_no_header_can_carry_is_refused_under_its_settings_name(tmp_path: Path, key: str) -> None:
+    (path := tmp_path / "keys").write_text(f"# die Schlüssel\nalpha\n{key}\n")
+    for settings, name in (
+        (Settings(api_keys=f"alpha,{key}"), "api_keys: key 2 of 2"),
+        (Settings(api_keys_file=path), f"api_keys_file {path}: key 2 of 2"),
+    ):
+        with pytest.raises(InvalidOptions, match=re.escape(name)) as refused:
+            settings.keys()
+        assert key not in str(refused.value)
+    path.write_text("# die Schlüssel\nalpha\n")
+    assert Settings(api_keys_file=path).keys() == ("alpha",)
+
+
+def test_serve_ends_at_once_with_a_key_that_would_never_match(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
+    environment = clean_environment() | {"STRAIGHTPCF_API_KEYS": "clé"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "api_keys" in done.stderr
+
+
+def test_compose_lets_a_server_end_in_peace() -> None:
+    compose = (Path(__file__).parents[2] / "compose.yaml").read_text()
+    grace = re.search(r"stop_grace_period: (\d+)s", compose)
+    assert grace
+    assert int(grace[1]) > 3 * Settings().shutdown_seconds  # requests, calls, jobs, one after the other
+
+
 @pytest.mark.parametrize(
     ("variable", "value"),
     [
         ("STRAIGHTPCF_PROT", "1"),
         ("STRAIGHTPCF_PORT", "many"),
+        ("STRAIGHTPCF_GRPC_PROT", "tcp://10.0.0.1:8000"),
+        ("STRAIGHTPCF_PORT", "http://10.0.0.1:8000"),
+        ("STRAIGHTPCF_SERVICE", "10.0.0.1"),
         ("STRAIGHTPCF_PORT", "65536"),
         ("STRAIGHTPCF_MAX_JOBS", "0"),
         ("STRAIGHTPCF_TILE_POINTS", "9999"),

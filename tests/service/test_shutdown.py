@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import signal
+import socket
 import subprocess
 import time
 import urllib.request
@@ -26,6 +27,8 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         wait_for(server.spooled_files)
         worker = server.worker_pid()
         server.process.send_signal(signal.SIGTERM)
+        wait_for(lambda: not _listens(server.url))  # as docs/api.md says of a draining server
+        assert request.poll() is None
         body, _ = request.communicate(timeout=60)
         assert np.load(io.BytesIO(body)).shape == (400, 3)
         server.process.wait(timeout=20)
@@ -54,6 +57,15 @@ def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(t
         assert job["state"] in ("queued", "starting", "processing")
         subprocess.run(["curl", "-s", "-X", "DELETE", f"{server.url}/jobs/{job['id']}"], check=True)
         assert not server.spooled_files()
+
+
+def _listens(url: str) -> bool:
+    host, port = url.removeprefix("http://").split(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=5).close()
+    except ConnectionRefusedError:
+        return False
+    return True
 
 
 def _runs(pid: int) -> bool:

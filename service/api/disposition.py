@@ -1,0 +1,24 @@
+"""What a Content-Disposition calls a file (RFC 6266, RFC 8187)."""
+
+from __future__ import annotations
+
+import re
+from urllib.parse import unquote
+
+from python_multipart.multipart import parse_options_header
+
+__all__ = ["disposition_name"]
+
+_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+_EXTENDED = re.compile(r";\s*filename\*\s*=\s*(UTF-8|ISO-8859-1)'[\w-]*'([\w!#$&+.^`|~%-]+)", re.ASCII | re.IGNORECASE)
+
+
+def disposition_name(header: str) -> str | None:
+    """Return the name of the file, or None; `filename*`, which can say any name, wins over `filename`.
+
+    header: as Starlette gives it, a character a byte. RFC 7578 wants no `filename*` in forms, but clients send it.
+    """
+    if extended := _EXTENDED.search(_QUOTED.sub('""', header)):
+        return unquote(extended[2], encoding=extended[1], errors="replace")
+    name = parse_options_header(header)[1].get(b"filename")
+    return None if name is None else name.decode("utf-8", errors="replace")

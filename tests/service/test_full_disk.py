@@ -1,0 +1,99 @@
+"""A server on a disk that is really full: a small one of its own, where the kernel lets us mount one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import suppress
+from multiprocessing import Pipe
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.backends.base import FileJob
+from straightpcf.service.backends.worker import Failed, _answer
+from tests.clouds import noisy, torus
+from tests.conftest import RunningServer, run_server
+from tests.waiting import wait_for
+
+DISK_BYTES = 2**21
+ON_A_SMALL_DISK = ("unshare", "-rm", "sh", "-c", f'mount -t tmpfs -o size={DISK_BYTES} tmpfs "$0" && exec "$@"')
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    folder = tmp_path_factory.mktemp("small")
+    (data := folder / "data").mkdir()
+    within = (*ON_A_SMALL_DISK, str(data))
+    if subprocess.run([*within, "true"], capture_output=True).returncode:
+        pytest.skip("this machine lets us mount nothing")
+    with run_server(folder, "--grpc-port", "0", environment={"STRAIGHTPCF_MIN_FREE_BYTES": "0"}, within=within) as it:
+        yield it
+
+
+@pytest.fixture
+def disk(server: RunningServer) -> Path:
+    """The small disk, seen from outside the server's namespace."""
+    return Path(f"/proc/{server.process.pid}/root{server.data_dir}")
+
+
+def filled(disk: Path) -> Path:
+    """Leave no byte."""
+    filler = disk / "filler"
+    with suppress(OSError), filler.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+    return filler
+
+
+def test_an_upload_that_fills_the_disk_is_told_so_and_leaves_nothing(server: RunningServer, disk: Path) -> None:
+    pieces = (bytes(2**16) for _ in range(2 * DISK_BYTES // 2**16))
+    answer = httpx2.post(f"{server.url}/jobs", content=pieces, timeout=20)
+    problem = answer.json()
+    assert (answer.status_code, problem["code"], problem["retryable"]) == (507, "spool_full", True)
+    assert answer.headers["retry-after"]
+    wait_for(lambda: not list((disk / "incoming").iterdir()))
+
+
+def test_grpc_says_it_too(server: RunningServer) -> None:
+    grpc = pytest.importorskip("grpc")
+    from straightpcf.points.wire import straightpcf_pb2 as pb
+    from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub
+
+    parts = [pb.CreateJobRequest(config=pb.JobConfig())] + [pb.CreateJobRequest(chunk=bytes(2**19))] * 8
+    with grpc.insecure_channel(server.grpc_url.removeprefix("grpc://")) as channel:
+        with pytest.raises(grpc.RpcError) as caught:
+            DenoiseServiceStub(channel).CreateJob(iter(parts))
+        assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_what_cannot_be_written_down_is_told_so_and_can_be_asked_again(server: RunningServer, disk: Path) -> None:
+    server.wait_until_ready()
+    os.kill(server.worker_pid(), signal.SIGSTOP)  # so that all but one of these wait
+    with httpx2.Client(base_url=server.url, timeout=20) as http:
+        ids = [http.put(f"/jobs/wait-{n}", content=b"0 0 0\n").json()["id"] for n in range(20)]
+        filler = filled(disk)
+        answers = [http.post(f"/jobs/{id}/cancel") for id in ids]
+        assert {answer.status_code for answer in answers} <= {200, 202, 507}
+        refused = [answer.json()["code"] for answer in answers if answer.status_code == 507]
+        assert set(refused) == {"spool_full"}
+        filler.unlink()
+        assert {http.post(f"/jobs/{id}/cancel").status_code for id in ids} <= {200, 202}
+        wait_for(lambda: all(http.get(f"/jobs/{id}").json()["finished_at"] for id in ids))
+
+
+def test_a_worker_whose_files_find_no_room_says_so(tmp_path: Path) -> None:
+    np.save(cloud := tmp_path / "cloud.npy", noisy(torus(400), 0.01))
+    job = FileJob(
+        id="1", source=cloud, target=tmp_path / "result", options=DenoiseOptions(iterations=1), max_points=1000,
+        patches=Path("/dev/full"),
+    )  # fmt: skip
+    ours, theirs = Pipe()
+    with ours, theirs:
+        assert _answer(load_filter(device="cpu"), job, theirs) == Failed("1", "spool_full", "the server's disk is full")

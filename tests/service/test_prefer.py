@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import pytest
+
+from straightpcf.service.api.prefer import parse_prefer
+
+
+@pytest.mark.parametrize(
+    ("prefer", "finished", "applied"),
+    [
+        ("respond-async", False, "respond-async"),
+        ("wait=10", True, "wait=10"),
+        ("wait=10", False, "wait=10"),
+        ("wait=90", True, "wait=90"),
+        ("wait=90", False, None),  # the server waited for 60
+        ("respond-async, wait=10", True, "wait=10"),
+        ("respond-async, wait=10", False, "respond-async, wait=10"),
+        ("respond-async, wait=90", False, "respond-async"),
+        ("handling=strict", True, None),
+    ],
+)
+def test_only_what_was_heeded_is_said_to_be_applied(prefer: str, finished: bool, applied: str | None) -> None:
+    said = parse_prefer([prefer]).applied(finished=finished, longest=60)
+    assert said.get("Preference-Applied") == applied
