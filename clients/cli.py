@@ -15,8 +15,17 @@ from typer.core import TyperGroup
 
 import straightpcf
 from straightpcf.clients import job_commands
-from straightpcf.clients.console import complain, exit_code, needs, print_json, print_table, progress_bar, show_noise
-from straightpcf.clients.job_commands import Format, Iterations, Key, Normals, Seed, Strength
+from straightpcf.clients.console import (
+    complain,
+    exit_code,
+    interruptible,
+    needs,
+    print_json,
+    print_table,
+    progress_bar,
+    show_noise,
+)
+from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
 from straightpcf.points import errors
 
 __all__ = ["app", "main"]
@@ -89,6 +98,7 @@ def denoise(
     strength: Strength = 1.0,
     normals: Normals = "keep",
     format: Format = None,
+    name: Name = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
@@ -100,19 +110,19 @@ def denoise(
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
+    name = name or (None if source == STDIO else source.name)
     if format is not None:
         format = format_named(format).name
-    elif target != STDIO and target.suffix.lower() != source.suffix.lower():
+    elif target != STDIO and target.suffix.lower() != Path(name or "").suffix.lower():
         format = format_for(target.name).name
     if url is not None and (device != Device.auto or weights is not None or threads is not None):
         raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
-    with _input(source) as path, _output(target) as out:
-        name = None if source == STDIO else source.name
+    with interruptible(), _input(source, name) as path, _output(target, Path(name or "").suffix) as out:
         if url is not None:
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
                 done = client.denoise(
                     path if name else path.read_bytes(), out, iterations=wanted.iterations, seed=seed,
-                    strength=strength, normals=wanted.normals, format=format, on_progress=show,
+                    strength=strength, normals=wanted.normals, format=format, name=name, on_progress=show,
                 )  # fmt: skip
             report: Any = done.report
         else:
@@ -149,7 +159,7 @@ def watch(
     if target.resolve() == folder.resolve():
         raise errors.InvalidOptions(f"--to is {target}, the folder that is watched; results would be taken for input")
     failures = 0
-    with _one_by_one(url, api_key, device, threads, wanted) as run:
+    with interruptible(), _one_by_one(url, api_key, device, threads, wanted) as run:
         for path, outcome in watch_folder(folder, target, run, once=once):
             if isinstance(outcome, Exception):
                 failures += 1
@@ -292,8 +302,11 @@ job_commands.install(app)
 
 
 @contextmanager
-def _input(source: Path) -> Iterator[Path]:
+def _input(source: Path, name: str | None) -> Iterator[Path]:
     import tempfile
+
+    from straightpcf.points.formats import recognised
+    from straightpcf.points.formats.base import HEAD_BYTES
 
     if source != STDIO:
         if not source.is_file():
@@ -302,11 +315,13 @@ def _input(source: Path) -> Iterator[Path]:
         return
     with tempfile.NamedTemporaryFile() as spool:  # formats are read from files, not from pipes
         _copy(sys.stdin.buffer, spool)
+        spool.seek(0)
+        recognised(spool.read(HEAD_BYTES), name)
         yield Path(spool.name)
 
 
 @contextmanager
-def _output(target: Path) -> Iterator[Path]:
+def _output(target: Path, suffix: str) -> Iterator[Path]:
     import tempfile
 
     if target != STDIO:
@@ -315,7 +330,7 @@ def _output(target: Path) -> Iterator[Path]:
         yield target
         return
     with tempfile.TemporaryDirectory() as folder:
-        yield (path := Path(folder) / "result")
+        yield (path := Path(folder) / f"result{suffix}")
         with path.open("rb") as result:
             _copy(result, sys.stdout.buffer)
 

@@ -1,7 +1,7 @@
 """What the command line shows and how it ends: progress on stderr, tables and JSON on stdout, one line for an error.
 
-Exit codes: 0 done, 1 no result for a reason outside (the port is taken), 2 usage, 3 refused (bad input, no such job),
-4 a device or a package is missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted or canceled.
+Exit codes: 0 done, 2 usage (a port that is taken, too), 3 refused (bad input, no such job), 4 a device or a package is
+missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted (by SIGTERM, too) or canceled.
 """
 
 from __future__ import annotations
@@ -16,7 +16,17 @@ import typer
 
 from straightpcf.points import errors
 
-__all__ = ["EXIT_CODES", "complain", "exit_code", "needs", "print_json", "print_table", "progress_bar", "show_noise"]
+__all__ = [
+    "EXIT_CODES",
+    "complain",
+    "exit_code",
+    "interruptible",
+    "needs",
+    "print_json",
+    "print_table",
+    "progress_bar",
+    "show_noise",
+]
 
 # The first class that matches counts: the narrow ones come before those that hold them.
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
@@ -60,6 +70,18 @@ def needs(extra: str) -> Iterator[None]:
         raise errors.MissingDependency(
             f"{exc.name} is not installed; pip install 'straightpcf[{extra}]' brings it"
         ) from exc
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C, so that what was begun here and on a server is ended."""
+    import signal
+
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -11,10 +11,12 @@ from straightpcf.points.errors import StraightPCFError
 
 __all__ = ["examine"]
 
+# As in pyproject.toml, without the extras that an extra takes in.
 EXTRAS = {
     "model": ("torch", "scipy", "fpsample", "safetensors"),
-    "service": ("fastapi", "uvicorn", "pydantic", "python-multipart"),
-    "las": ("laspy", "lazrs"),
+    "service": ("fastapi", "uvicorn", "pydantic", "python-multipart", "prometheus-client"),
+    "grpc": ("grpcio", "grpcio-health-checking", "grpcio-reflection", "grpcio-status", "protobuf"),
+    "las": ("lazrs",),
     "open3d": ("open3d",),
 }
 

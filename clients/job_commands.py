@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from straightpcf.clients.console import print_json, print_table, progress_bar, show_noise
+from straightpcf.clients.console import interruptible, print_json, print_table, progress_bar, show_noise
 from straightpcf.points.errors import InvalidOptions
 
 if TYPE_CHECKING:
     from straightpcf.clients.sdk import Client, JobInfo
 
-__all__ = ["Format", "Iterations", "Key", "Seed", "Strength", "Url", "connect", "install"]
+__all__ = ["Format", "Iterations", "Key", "Name", "Seed", "Strength", "Url", "connect", "install"]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -29,6 +29,7 @@ Seed = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 Strength = Annotated[float, typer.Option(help="0..1, the share of the displacement to apply.")]
 Normals = Annotated[str, typer.Option(metavar="keep|recompute", help="Of a PLY or PCD file that has some.")]
 Format = Annotated[str | None, typer.Option("--format", help="Of the result (ply, xyz, ...); else the input's.")]
+Name = Annotated[str | None, typer.Option("--name", help="What the input is called; text on stdin needs a suffix.")]
 
 
 def install(app: typer.Typer) -> None:
@@ -44,7 +45,7 @@ def connect(url: str, api_key: str | None) -> Iterator[Client]:
         raise InvalidOptions(f"--url is {url[:80]!r}; it must begin with http://, https://, grpc:// or grpcs://")
     from straightpcf.clients.sdk import Client
 
-    with Client(url, api_key=api_key) as client:
+    with interruptible(), Client(url, api_key=api_key) as client:
         yield client
 
 
@@ -55,6 +56,7 @@ def submit(
     strength: Strength = 1.0,
     normals: Normals = "keep",
     format: Format = None,
+    name: Name = None,
     id: Annotated[str | None, typer.Option(help="A name for the job, to make it only once.")] = None,
     url: Url = DEFAULT_URL,
     api_key: Key = None,
@@ -63,11 +65,14 @@ def submit(
     """Hand clouds to a server and print their jobs' ids; the jobs outlive this command."""
     if id is not None and len(sources) > 1:
         raise InvalidOptions(f"--id names one job, and there are {len(sources)} files")
+    if name is not None and len(sources) > 1:
+        raise InvalidOptions(f"--name is of one file, and there are {len(sources)}")
     with connect(url, api_key) as client:
         for source in sources:
             content: Any = sys.stdin.buffer.read() if str(source) == "-" else source
             job = client.jobs.create(
-                content, iterations=iterations, seed=seed, strength=strength, normals=normals, format=format, id=id  # type: ignore[arg-type]
+                content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
+                format=format, name=name, id=id,
             )  # fmt: skip
             print_json(job.info.json) if as_json else typer.echo(job.id)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import stat
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from straightpcf.points.errors import ConnectionFailed, ServerBusy
 from straightpcf.points.formats import FORMATS
 
 __all__ = ["watch_folder"]
@@ -14,47 +17,60 @@ __all__ = ["watch_folder"]
 LOOK_SECONDS = 1.0
 
 Outcome = tuple[Path, Any | Exception]
+Stamp = tuple[int, int]
 
 
 def watch_folder(
     folder: Path, target: Path, denoise: Callable[[Path, Path], Any], *, once: bool = False
 ) -> Iterator[Outcome]:
-    """Denoise every cloud in `folder` that has no newer namesake in `target`, as they come; yield each outcome.
+    """Denoise every cloud in `folder` that has no namesake of the same time in `target`, as they come.
 
-    A file is taken when its size and time have not changed for a second, so that one which is still being written is
-    left alone; one that failed is tried again when it changes. once: end when nothing is left to do.
+    A result gets the time of its input as it was before it was read: an input that is replaced meanwhile, even by an
+    older file, is seen to be another. A file is taken when its size and time have not changed for a second, so that one
+    which is still being written is left alone; one that failed is tried again when it changes, or, where only the
+    server could not be had, at the next look. Yields each outcome. once: look once, and end.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
-    failed: dict[Path, tuple[int, int]] = {}
-    before: dict[Path, tuple[int, int]] = {}
+    tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
+    before: dict[Path, Stamp] = {}
     while True:
         seen = {
-            path: _stamp(path)
+            path: stamp
             for path in sorted(folder.iterdir())
-            if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
+            if path.suffix.lower() in suffixes and not path.name.startswith(".") and (stamp := _stamp(path))
         }
-        waiting = {
-            path: stamp for path, stamp in seen.items() if failed.get(path) != stamp and not _is_done(path, target)
-        }
-        for path, stamp in waiting.items():
+        for path, stamp in seen.items():
+            result = target / path.name
+            if tried.get(path) == stamp or _is_done(result, stamp):
+                continue
             if not once and before.get(path) != stamp:
                 continue  # perhaps it still grows
             try:
-                yield path, denoise(path, target / path.name)
-            except Exception as error:
-                failed[path] = stamp
+                report = denoise(path, result)
+                os.utime(result, ns=(stamp[1], stamp[1]))
+            except (ConnectionFailed, ServerBusy) as error:
                 yield path, error
+            except Exception as error:
+                tried[path] = stamp
+                yield path, error
+            else:
+                tried[path] = stamp
+                yield path, report
         if once:
             return
         before = seen
         time.sleep(LOOK_SECONDS)
 
 
-def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
+def _stamp(path: Path) -> Stamp | None:
+    """Return the size and time of a file; None if it is none, or not any more."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None
 
 
-def _is_done(path: Path, target: Path) -> bool:
-    done = target / path.name
-    return done.exists() and done.stat().st_mtime_ns >= path.stat().st_mtime_ns
+def _is_done(result: Path, stamp: Stamp) -> bool:
+    done = _stamp(result)
+    return done is not None and done[1] == stamp[1]

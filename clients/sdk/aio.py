@@ -59,13 +59,17 @@ class AsyncClient:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
+        name: str | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Denoised:
         """Do as `Client.denoise`; on_progress is an ordinary function."""
         path = None if target is None else Path(target)
-        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "normals": normals, "format": format}
-        return await self._transport.run(flows.denoise(source, path, on_progress, timeout, **wanted))
+        flow = flows.denoise(
+            source, path, on_progress, timeout, silence=self._transport.timeout, iterations=iterations, seed=seed,
+            strength=strength, normals=normals, format=format, name=name,
+        )  # fmt: skip
+        return await self._transport.run(flow)
 
     async def health(self) -> Health:
         """Do as `Client.health`."""
@@ -139,7 +143,8 @@ class AsyncJob:
 
     async def wait(self, *, timeout: float | None = None, on_progress: OnProgress | None = None) -> JobInfo:
         """Do as `Job.wait`."""
-        self.info = await self._transport.run(flows.wait(self.id, timeout, on_progress))
+        flow = flows.wait(self.id, timeout, on_progress, silence=self._transport.timeout)
+        self.info = await self._transport.run(flow)
         return self.info
 
     async def events(self, *, after: int = 0) -> AsyncIterator[Event]:

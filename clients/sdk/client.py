@@ -29,7 +29,7 @@ class Client:
 
     url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
     api_key: sent as a bearer token.
-    timeout: seconds of silence that are borne, None for any.
+    timeout: seconds of silence that are borne, None for any; of streams (events, patches, progress) at least 60.
     max_retries: of a busy server and of a broken connection; every other error is raised at once.
     """
 
@@ -64,12 +64,14 @@ class Client:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
+        name: str | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Denoised:
         """Denoise one cloud: the same points in the same order, every other field unchanged.
 
         source: a path, the bytes of a file, an (N, 3) array, or an open3d cloud.
+        name: of the file, where the source has none: bytes of text or KITTI are known by its suffix only.
         target: where to write the result, complete or not at all; by default it is held in memory.
         normals: "recompute" them at the new positions, where a PLY or PCD file has some.
         format: of the result; by default that of the target's name, else that of the source.
@@ -77,8 +79,11 @@ class Client:
         Raises the StraightPCFError that the server met. Whatever ends this early ends the work on the server too.
         """
         path = None if target is None else Path(target)
-        wanted = {"iterations": iterations, "seed": seed, "strength": strength, "normals": normals, "format": format}
-        return self._transport.run(flows.denoise(source, path, on_progress, timeout, **wanted))
+        flow = flows.denoise(
+            source, path, on_progress, timeout, silence=self._transport.timeout, iterations=iterations, seed=seed,
+            strength=strength, normals=normals, format=format, name=name,
+        )  # fmt: skip
+        return self._transport.run(flow)
 
     def health(self) -> Health:
         """Ask whether the server is there, and warm."""
@@ -155,7 +160,8 @@ class Job:
 
     def wait(self, *, timeout: float | None = None, on_progress: OnProgress | None = None) -> JobInfo:
         """Return when it is finished, well or not; raises JobNotFinished after timeout seconds."""
-        self.info = self._transport.run(flows.wait(self.id, timeout, on_progress))
+        flow = flows.wait(self.id, timeout, on_progress, silence=self._transport.timeout)
+        self.info = self._transport.run(flow)
         return self.info
 
     def events(self, *, after: int = 0) -> Iterator[Event]:

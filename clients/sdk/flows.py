@@ -37,7 +37,7 @@ __all__ = [
     "wait",
 ]
 
-POLL_SECONDS = 20.0  # a server is asked this long for a job's end before it is asked again
+POLL_SECONDS = 20.0  # at most: a server is asked this long for a job's end before it is asked again
 FAREWELL_SECONDS = 5.0  # to give up a job that nobody waits for any more
 
 _T = TypeVar("_T")
@@ -82,13 +82,19 @@ def delete(id: str) -> Flow[None]:
     yield request.delete_call(id), Body()
 
 
-def wait(id: str, timeout: float | None, on_progress: OnProgress | None) -> Flow[JobInfo]:
-    """Return the job when it is finished; raises JobNotFinished after timeout seconds."""
+def wait(
+    id: str, timeout: float | None, on_progress: OnProgress | None, *, silence: float | None = None
+) -> Flow[JobInfo]:
+    """Return the job when it is finished; raises JobNotFinished after timeout seconds.
+
+    silence: seconds that the client bears, None for any; a healthy server answers within half of them.
+    """
     if on_progress is not None and timeout is None:
         return (yield request.events_call(id), _Watched(on_progress))  # type: ignore[no-any-return]
+    poll = POLL_SECONDS if silence is None else min(POLL_SECONDS, silence / 2)
     deadline = None if timeout is None else time.monotonic() + timeout
     while True:
-        left = POLL_SECONDS if deadline is None else max(0.0, min(POLL_SECONDS, deadline - time.monotonic()))
+        left = poll if deadline is None else max(0.0, min(poll, deadline - time.monotonic()))
         seconds = left if on_progress is None else min(left, 0.5)
         job: JobInfo = yield request.job_call(id, wait=seconds), Body(JobInfo.parse)
         if on_progress is not None:
@@ -115,14 +121,20 @@ def fetch(job: JobInfo, target: Path | None, *, source: Source = None, request_i
 
 
 def denoise(
-    source: Source, target: Path | None, on_progress: OnProgress | None, timeout: float | None, **wanted: Any
+    source: Source,
+    target: Path | None,
+    on_progress: OnProgress | None,
+    timeout: float | None,
+    *,
+    silence: float | None,
+    **wanted: Any,
 ) -> Flow[Denoised]:
     """Make a job, wait for it, fetch its result and remove it; whatever ends this early ends the job too."""
     call = request.upload_call(source, target, **wanted)
     id = call.path.rpartition("/")[2]
     try:
         yield call, Body(JobInfo.parse)
-        job = yield from wait(id, timeout, on_progress)
+        job = yield from wait(id, timeout, on_progress, silence=silence)
         cloud = source if type(source).__module__.startswith("open3d") else None
         return (yield from fetch(job, target, source=cloud, request_id=call.request_id))
     finally:

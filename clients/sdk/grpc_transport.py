@@ -37,8 +37,8 @@ class GrpcTransport(Transport):
     """Talk to the gRPC service."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.max_retries = max_retries
-        self._url, self._key, self._timeout = url, api_key, timeout
+        self.timeout, self.max_retries = timeout, max_retries
+        self._url, self._key = url, api_key
         target, credentials = _target(url)
         if credentials is None:
             self._channel = grpc.insecure_channel(target, options=_OPTIONS)
@@ -55,7 +55,7 @@ class GrpcTransport(Transport):
         send = upload_messages(call) if call.rpc == UPLOAD else request_of(call, receiver)
         try:
             answer = Answer(call, receiver)
-            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self._timeout))
+            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
             for message in came if hasattr(came, "__next__") else (came,):
                 answer.take(message)
                 yield
@@ -68,8 +68,8 @@ class AsyncGrpcTransport(AsyncTransport):
     """Talk to the gRPC service from a coroutine."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.max_retries = max_retries
-        self._url, self._key, self._timeout = url, api_key, timeout
+        self.timeout, self.max_retries = timeout, max_retries
+        self._url, self._key = url, api_key
         self._channel: Any = None  # it belongs to the loop that makes the first call
         self._stub: Any = None
         _target(url)
@@ -85,7 +85,7 @@ class AsyncGrpcTransport(AsyncTransport):
         send = _asynchronous(upload_messages(call)) if call.rpc == UPLOAD else request_of(call, receiver)
         try:
             answer = Answer(call, receiver)
-            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self._timeout))
+            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
             if hasattr(came, "__aiter__"):
                 async for message in came:
                     answer.take(message)

@@ -22,7 +22,7 @@ class HttpTransport(Transport):
     """Talk to the REST API."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.max_retries = max_retries
+        self.timeout, self.max_retries = timeout, max_retries
         self._http = httpx2.Client(**_options(url, api_key, timeout))
 
     def close(self) -> None:
@@ -31,8 +31,9 @@ class HttpTransport(Transport):
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one request."""
+        asked = _request(call, receiver, self.timeout)
         try:
-            with call.open_body() as body, self._http.stream(**_request(call, receiver), content=body) as response:
+            with call.open_body() as body, self._http.stream(**asked, content=body) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
                     for item in httpx2.EventSource(response) if call.events else response.iter_bytes():
@@ -50,7 +51,7 @@ class AsyncHttpTransport(AsyncTransport):
     """Talk to the REST API from a coroutine."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.max_retries = max_retries
+        self.timeout, self.max_retries = timeout, max_retries
         self._http = httpx2.AsyncClient(**_options(url, api_key, timeout))
 
     async def close(self) -> None:
@@ -59,8 +60,9 @@ class AsyncHttpTransport(AsyncTransport):
 
     async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
         """Make one request."""
+        asked = _request(call, receiver, self.timeout)
         try:
-            async with self._http.stream(**_request(call, receiver), content=call.stream_body()) as response:
+            async with self._http.stream(**asked, content=call.stream_body()) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
                     async for item in httpx2.EventSource(response) if call.events else response.aiter_bytes():
@@ -78,11 +80,20 @@ def _options(url: str, api_key: str | None, timeout: float | None) -> dict[str, 
     return {
         "base_url": url,
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
-        "timeout": httpx2.Timeout(timeout, connect=CONNECT_TIMEOUT_SECONDS),
+        "timeout": _silence(timeout),
     }
 
 
-def _request(call: Call, receiver: Receiver) -> dict[str, Any]:
-    timeout = {} if call.timeout is None else {"timeout": call.timeout}
-    headers = {**call.all_headers(), **receiver.headers()}
-    return {"method": call.method, "url": call.path, "params": call.params, "headers": headers, **timeout}
+def _request(call: Call, receiver: Receiver, timeout: float | None) -> dict[str, Any]:
+    silence = None if timeout is None else _silence(max(timeout, call.silence))
+    return {
+        "method": call.method,
+        "url": call.path,
+        "params": call.params,
+        "headers": {**call.all_headers(), **receiver.headers()},
+        "timeout": silence if call.timeout is None else call.timeout,
+    }
+
+
+def _silence(seconds: float | None) -> httpx2.Timeout:
+    return httpx2.Timeout(seconds, connect=CONNECT_TIMEOUT_SECONDS)

@@ -15,8 +15,9 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.errors import InvalidCloud
-from straightpcf.points.formats import format_for, format_named
+from straightpcf.points.errors import InvalidCloud, InvalidRequest
+from straightpcf.points.formats import format_for, format_named, recognised
+from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 
@@ -38,6 +39,7 @@ __all__ = [
 ]
 
 CHUNK_BYTES = 2**18
+STREAM_SECONDS = 60.0  # a stream is silent while its job waits; of events something comes every 15
 
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.
 Source: TypeAlias = str | Path | bytes | npt.NDArray[Any] | Any
@@ -51,7 +53,8 @@ class Call:
 
     rpc, fields: the same as a call of the gRPC service, in the JSON form of its message.
     request_id: names the request in the server's log, the same for every attempt.
-    timeout: seconds of silence to bear, None for the client's own. events: the answer is a stream of events.
+    timeout: seconds of silence to bear, None for the client's own. silence: those to bear at least.
+    events: the answer is a stream of events. once: do not try again.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -62,6 +65,7 @@ class Call:
     headers: Mapping[str, str] = field(default_factory=dict)
     body: bytes | Path | None = None
     timeout: float | None = None
+    silence: float = 0.0
     events: bool = False
     once: bool = False
     request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -99,7 +103,7 @@ def upload_call(
 ) -> Call:
     """Build the request that hands over one cloud, as job `id`.
 
-    Raises InvalidOptions, InvalidCloud, UnknownFormat, OSError before anything is sent.
+    Raises InvalidOptions, InvalidRequest, InvalidCloud, UnknownFormat, OSError before anything is sent.
     """
     options = DenoiseOptions.parse(
         iterations=str(iterations), seed=str(seed), strength=str(strength), normals=str(normals)
@@ -108,6 +112,8 @@ def upload_call(
         raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
     own_name, body = _name_and_body(source)
     name = name or own_name
+    if name is None and isinstance(body, bytes):
+        recognised(body[:HEAD_BYTES], None)
     if format is None and target is not None and target.suffix.lower() != Path(name or "").suffix.lower():
         format = format_for(target.name).name
     params = {name: str(value) for name, value in asdict(options).items()}
@@ -115,6 +121,8 @@ def upload_call(
         params["filename"] = name
     if format is not None:
         params["format"] = format_named(format).name
+    if key is not None and not (key.isascii() and key.isprintable()):
+        raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
     size = body.stat().st_size if isinstance(body, Path) else len(body)
     headers = {
         "Content-Type": "application/octet-stream",
@@ -153,13 +161,18 @@ def events_call(id: str) -> Call:
     """Build the request that follows a job."""
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
     path = _job(id, "events")
-    return Call(method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True)
+    return Call(
+        method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True, silence=STREAM_SECONDS
+    )
 
 
 def patches_call(id: str) -> Call:
     """Build the request for the patch stream."""
     headers = {"Accept": PATCHES_MEDIA_TYPE}
-    return Call(method="GET", path=_job(id, "stream"), rpc="StreamPatches", fields={"id": id}, headers=headers)
+    path = _job(id, "stream")
+    return Call(
+        method="GET", path=path, rpc="StreamPatches", fields={"id": id}, headers=headers, silence=STREAM_SECONDS
+    )
 
 
 def result_call(id: str) -> Call:

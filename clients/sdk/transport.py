@@ -12,6 +12,7 @@ from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure, next_delay
+from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async"]
 
@@ -19,7 +20,8 @@ _T = TypeVar("_T")
 
 
 def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> Transport:
-    """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`."""
+    """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`; raises InvalidOptions."""
+    _check_key(api_key)
     if _is_grpc(url):
         from straightpcf.clients.sdk.grpc_transport import GrpcTransport
 
@@ -31,6 +33,7 @@ def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries
 
 def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> AsyncTransport:
     """Do as `connect`."""
+    _check_key(api_key)
     if _is_grpc(url):
         from straightpcf.clients.sdk.grpc_transport import AsyncGrpcTransport
 
@@ -38,6 +41,11 @@ def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_r
     from straightpcf.clients.sdk.http_transport import AsyncHttpTransport
 
     return AsyncHttpTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
+
+
+def _check_key(api_key: str | None) -> None:
+    if api_key is not None and not (api_key.isascii() and api_key.isprintable()):
+        raise InvalidOptions("the API key holds more than printable ASCII, which no header can carry")
 
 
 def _is_grpc(url: str) -> bool:
@@ -66,8 +74,9 @@ class Attempts:
 
 
 class Transport(ABC):
-    """Run flows in ordinary code."""
+    """Run flows in ordinary code; timeout: seconds of silence to bear, None for any."""
 
+    timeout: float | None
     max_retries: int
 
     @abstractmethod
@@ -106,6 +115,7 @@ class Transport(ABC):
 class AsyncTransport(ABC):
     """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
 
+    timeout: float | None
     max_retries: int
 
     @abstractmethod

@@ -24,7 +24,7 @@ __all__ = ["EdgeMax", "build", "build_all", "instruction_set", "knn", "load"]
 
 _SOURCE = Path(__file__).with_name("edgeconv.cpp")
 _SHIPPED = Path(__file__).with_name("lib")
-# Newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
+# Of x86, newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
 _INSTRUCTION_SETS = {
     "avx512_bf16": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx512bf16 -mavx2 -mfma -mbmi -mbmi2",
     "avx512bw": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx2 -mfma -mbmi -mbmi2",
@@ -41,6 +41,8 @@ _BUILD_SECONDS = 120
 @functools.cache
 def instruction_set() -> str:
     """Name the newest instruction set this processor has among those the kernels are compiled for."""
+    if not _is_x86():  # under emulation /proc/cpuinfo may be the host's
+        return "generic"
     try:
         listed = set(Path("/proc/cpuinfo").read_text().split())
     except OSError:
@@ -92,8 +94,12 @@ def _cache() -> Path:
 
 
 def build_all(folder: Path) -> list[Path]:
-    """Compile for every instruction set, as an image does that does not know where it will run."""
-    return [build(folder, name) for name in _INSTRUCTION_SETS]
+    """Compile for every instruction set of this architecture, as an image does that does not know its processor."""
+    return [build(folder, name) for name in _INSTRUCTION_SETS if name == "generic" or _is_x86()]
+
+
+def _is_x86() -> bool:
+    return platform.machine() in ("x86_64", "AMD64")
 
 
 def _file_name(target_set: str | None = None) -> str:

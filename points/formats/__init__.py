@@ -18,7 +18,7 @@ from straightpcf.points.formats.npy import Npy
 from straightpcf.points.formats.npz import Npz
 from straightpcf.points.formats.pcd import Pcd
 from straightpcf.points.formats.ply import Ply
-from straightpcf.points.formats.xyz import Xyz
+from straightpcf.points.formats.xyz import Csv, Pts, Xyz
 
 __all__ = [
     "DEFAULT_MAX_POINTS",
@@ -28,10 +28,11 @@ __all__ = [
     "format_for",
     "format_named",
     "read_cloud",
+    "recognised",
     "write_cloud",
 ]
 
-FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Kitti())
+FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Csv(), Pts(), Kitti())
 
 
 def estimate_points(path: Path, *, name: str | None = None) -> int:
@@ -40,7 +41,7 @@ def estimate_points(path: Path, *, name: str | None = None) -> int:
         head = file.read(HEAD_BYTES)
     size = path.stat().st_size
     try:
-        return min(_recognised(head, name or path.name).estimate(head, size), size)
+        return min(recognised(head, name or path.name).estimate(head, size), size)
     except (StraightPCFError, ValueError, struct.error):
         return size // 16  # reading it will say what is wrong
 
@@ -55,9 +56,7 @@ def read_cloud(
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     called = name or path.name
-    if not head:
-        raise MalformedFile(f"{called} is empty (0 bytes)")
-    format = _recognised(head, called)
+    format = recognised(head, called)
     try:
         return format.read(path, max_points=max_points), format
     except StraightPCFError:
@@ -94,14 +93,22 @@ def format_for(filename: str) -> Format:
     )
 
 
-def _recognised(head: bytes, called: str) -> Format:
+def recognised(head: bytes, called: str | None) -> Format:
+    """Return the format of a file by its first bytes, or by the suffix of what it is called.
+
+    Raises UnknownFormat, MalformedFile if it is empty.
+    """
+    if not head:
+        raise MalformedFile(f"{called or 'the cloud'} is empty (0 bytes)")
     for format in FORMATS:
         if format.has_magic and format.sniff(head):
             return format
-    suffix = PurePath(called).suffix.lower()
+    suffix = PurePath(called or "").suffix.lower()
     for format in FORMATS:
         if not format.has_magic and suffix in format.suffixes:
             return format
+    if called is None:
+        raise UnknownFormat(f"the cloud begins with {head[:8]!r}, which no format does: it needs a name with a suffix")
     raise UnknownFormat(
         f"{PurePath(called).name[:80]} begins with {head[:8]!r}, which no format does, and its suffix names none; "
         f"there are {_known()}"

@@ -54,7 +54,7 @@ class Pcd(Format):
             return True
         lines = (line.strip() for line in head.split(b"\n"))
         first = next((line for line in lines if line and not line.startswith(b"#")), b"")
-        return first.startswith((b"VERSION ", b"FIELDS "))
+        return first.startswith((b"VERSION ", b"FIELDS ", b"COLUMNS "))
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read all fields; those with COUNT > 1 become (N, COUNT) attributes."""

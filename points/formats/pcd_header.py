@@ -61,6 +61,7 @@ def read_header(raw: bytes) -> PcdHeader:
             keyword, *words = line.decode("ascii").split()
         except UnicodeDecodeError as exc:
             raise MalformedFile(f"line {number} of the PCD header is not ASCII: {shown(line)}") from exc
+        keyword = "FIELDS" if keyword == "COLUMNS" else keyword  # its name in old files
         if keyword not in _KEYWORDS or keyword in entries:
             raise MalformedFile(f"line {number} of the PCD header is unknown or there twice: {shown(line)}")
         entries[keyword] = words
@@ -72,19 +73,21 @@ def read_header(raw: bytes) -> PcdHeader:
 
 
 def _fields(entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
-    for keyword in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT"):
+    """Read the fields; as PCL does, take those of an old file without SIZE and TYPE for float32."""
+    for keyword in ("FIELDS",) if {"SIZE", "TYPE"}.isdisjoint(entries) else ("FIELDS", "SIZE", "TYPE"):
         if keyword not in entries:
             raise MalformedFile(f"the PCD header has no {keyword}")
     names = entries["FIELDS"]
+    sizes, kinds = entries.get("SIZE", ["4"] * len(names)), entries.get("TYPE", ["F"] * len(names))
     counts = entries.get("COUNT", ["1"] * len(names))
-    if not len(names) == len(entries["SIZE"]) == len(entries["TYPE"]) == len(counts):
+    if not len(names) == len(sizes) == len(kinds) == len(counts):
         raise MalformedFile(
             f"the PCD header has {len(names)} FIELDS, but SIZE, TYPE and COUNT of "
-            f"{len(entries['SIZE'])}, {len(entries['TYPE'])} and {len(counts)}"
+            f"{len(sizes)}, {len(kinds)} and {len(counts)}"
         )
     fields: list[PcdField] = []
     used: set[str] = set()
-    for name, size, kind, count in zip(names, entries["SIZE"], entries["TYPE"], counts, strict=True):
+    for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
         label = name
         while label in used:
             label += "_"
@@ -117,8 +120,14 @@ def _field(label: str, size: str, kind: str, count: str) -> PcdField:
 
 
 def _points(entries: dict[str, list[str]]) -> int:
-    width, height = (_whole(" ".join(entries[key]), f"PCD {key}") for key in ("WIDTH", "HEIGHT"))
-    points = _whole(" ".join(entries["POINTS"]), "PCD POINTS") if "POINTS" in entries else width * height
+    """Read how many points there are; an old file has POINTS alone, and HEIGHT is 1 if it is not there."""
+    texts = {"HEIGHT": "1"} | {key: " ".join(words) for key, words in entries.items()}
+    if "HEIGHT" not in entries and "POINTS" in entries:
+        texts.setdefault("WIDTH", texts["POINTS"])
+    if "WIDTH" not in texts:
+        raise MalformedFile("the PCD header has no WIDTH")
+    width, height = (_whole(texts[key], f"PCD {key}") for key in ("WIDTH", "HEIGHT"))
+    points = _whole(texts["POINTS"], "PCD POINTS") if "POINTS" in texts else width * height
     if points != width * height:
         raise MalformedFile(f"PCD POINTS is {points}, but WIDTH {width} x HEIGHT {height} is {width * height}")
     return points

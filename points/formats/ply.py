@@ -107,11 +107,12 @@ def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, Ascii
         rows: AsciiRows | BinaryRows
         if header.is_ascii:
             rows = ascii_rows(raw, at, element, line, keep=element is vertex)
+            line = rows.line
         else:
             rows = binary_rows(raw, at, element)
         if element is vertex:
             found = at, rows
-        at, line = rows.end, line + element.count
+        at = rows.end
     if found is None:  # pragma: no cover - _vertex has looked
         raise MalformedFile("the PLY file has no element vertex")
     return found

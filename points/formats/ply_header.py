@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ __all__ = ["MAX_HEADER_BYTES", "MAX_LINE_BYTES", "PlyElement", "PlyHeader", "Ply
 
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 16
+MAX_ELEMENTS = 1024
 MAX_PROPERTIES = 4096
 
 _TYPES = {
@@ -70,7 +72,8 @@ def read_header(raw: bytes) -> PlyHeader:
     if lines[0].strip() != b"ply":
         raise MalformedFile(f"line 1 of a PLY file must be 'ply', not {shown(lines[0])}")
     encoding: str | None = None
-    elements: list[tuple[str, int, list[PlyProperty]]] = []
+    elements: dict[str, tuple[int, dict[str, PlyProperty]]] = {}
+    properties: dict[str, PlyProperty] = {}  # of the last element
     for number, line in enumerate(lines[1:-1], start=2):
         words = line.split()
         keyword = words[0] if words else b""
@@ -81,16 +84,18 @@ def read_header(raw: bytes) -> PlyHeader:
         if keyword == b"format" and encoding is None:
             encoding = _encoding(texts, where)
         elif keyword == b"element" and encoding is not None:
-            elements.append(_element(texts, [name for name, _, _ in elements], where))
+            name, count = _element(texts, elements, where)
+            properties = {}
+            elements[name] = count, properties
         elif keyword == b"property" and elements:
-            properties = elements[-1][2]
-            properties.append(_property(texts, _BYTE_ORDERS[str(encoding)], [p.name for p in properties], where))
+            found = _property(texts, _BYTE_ORDERS[str(encoding)], properties, where)
+            properties[found.name] = found
         else:
             raise MalformedFile(f"{where} is not understood, or stands in the wrong place: {shown(line)}")
     if encoding is None:
         raise MalformedFile("the PLY header has no format line")
-    found = tuple(PlyElement(name, count, tuple(properties)) for name, count, properties in elements)
-    return PlyHeader(encoding == "ascii", found, size, len(lines))
+    described = tuple(PlyElement(name, count, tuple(of.values())) for name, (count, of) in elements.items())
+    return PlyHeader(encoding == "ascii", described, size, len(lines))
 
 
 def _lines(raw: bytes) -> tuple[list[bytes], int]:
@@ -130,7 +135,7 @@ def _encoding(words: list[str], where: str) -> str:
     return words[1]
 
 
-def _element(words: list[str], before: list[str], where: str) -> tuple[str, int, list[PlyProperty]]:
+def _element(words: list[str], before: Collection[str], where: str) -> tuple[str, int]:
     if len(words) != 3:
         raise MalformedFile(f"{where}: an element has a name and a count, not {len(words) - 1} words")
     name, count = words[1][:80], words[2]
@@ -138,10 +143,12 @@ def _element(words: list[str], before: list[str], where: str) -> tuple[str, int,
         raise MalformedFile(f"{where}: element {name} has the count {count[:40]!r}, which is no whole number >= 0")
     if name in before:
         raise MalformedFile(f"{where}: element {name} is declared twice")
-    return name, int(count), []
+    if len(before) >= MAX_ELEMENTS:
+        raise UnsupportedCloud(f"{where}: the file has more than {MAX_ELEMENTS} elements, the limit")
+    return name, int(count)
 
 
-def _property(words: list[str], order: str, before: list[str], where: str) -> PlyProperty:
+def _property(words: list[str], order: str, before: Collection[str], where: str) -> PlyProperty:
     is_list = words[1:2] == ["list"]
     if len(words) != (5 if is_list else 3):
         raise MalformedFile(f"{where}: a property has a type and a name, a list a second type, not {words[1:6]}")

@@ -21,12 +21,13 @@ _Offsets = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AsciiRows:
-    """Hold the scalars of a text element; end: byte offset after its last row.
+    """Hold the scalars of a text element; end, line: byte offset and line number after its last row.
 
     starts, ends: scalar name -> (N,) int64, byte offsets of its token.  values: name -> (N,), of the declared type.
     """
 
     end: int
+    line: int
     starts: dict[str, _Offsets]
     ends: dict[str, _Offsets]
     values: dict[str, npt.NDArray[Any]]
@@ -45,10 +46,10 @@ class BinaryRows:
     offsets: dict[str, _Offsets]
 
 
-def ascii_rows(raw: bytes, begin: int, element: PlyElement, first_line: int, *, keep: bool) -> AsciiRows:
+def ascii_rows(raw: bytes, begin: int, element: PlyElement, line: int, *, keep: bool) -> AsciiRows:
     """Walk a text element, one row a line; its scalars are kept if `keep`, else only checked for being there.
 
-    first_line: the file's line number of the first row, for error messages.
+    Blank lines are passed over, as readers that go from word to word do.  line: the file's line number at `begin`.
     """
     check_room(
         element.count * max(2 * len(element.properties), 1) - 1,
@@ -59,10 +60,13 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, first_line: int, *, 
     pieces: dict[str, list[tuple[_Offsets, _Offsets, npt.NDArray[Any]]]] = {name: [] for name in scalars}
     rows_left, end = element.count, begin
     for lines, block_end in blocks(raw, begin) if rows_left else ():
-        here = lines.head(rows_left)
-        _walk(here, element, first_line + element.count - rows_left, pieces)
-        end = int(lines.line_starts[len(here)]) if len(here) < len(lines) else block_end
-        rows_left -= len(here)
+        # A row without properties is a blank line.
+        filled = np.flatnonzero(lines.counts if element.properties else lines.counts + 1)[:rows_left]
+        _walk(lines.pick(filled), element, line + filled, pieces)
+        rows_left -= len(filled)
+        seen = len(lines) if rows_left else int(filled[-1]) + 1
+        end = int(lines.line_starts[seen]) if seen < len(lines) else block_end
+        line += seen
         if rows_left == 0:
             break
     if rows_left:
@@ -73,6 +77,7 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, first_line: int, *, 
     kinds = {p.name: p.dtype for p in element.properties}
     return AsciiRows(
         end,
+        line,
         {name: _joined([piece[0] for piece in parts], np.dtype(np.int64)) for name, parts in pieces.items()},
         {name: _joined([piece[1] for piece in parts], np.dtype(np.int64)) for name, parts in pieces.items()},
         {name: _joined([piece[2] for piece in parts], kinds[name]) for name, parts in pieces.items()},
@@ -82,13 +87,13 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, first_line: int, *, 
 def _walk(
     lines: Lines,
     element: PlyElement,
-    first_line: int,
+    numbers: _Offsets,
     pieces: dict[str, list[tuple[_Offsets, _Offsets, npt.NDArray[Any]]]],
 ) -> None:
-    """Step through the properties of all lines at once; `at` is each line's next token."""
+    """Step through the properties of all lines at once; `at` is each line's next token.  numbers: of the lines."""
     at, stop = lines.first.copy(), lines.first + lines.counts
     for prop in element.properties:
-        _require(at < stop, lines, element, prop, first_line)
+        _require(at < stop, lines, element, prop, numbers)
         starts, ends = lines.starts[at], lines.ends[at]
         at += 1
         if prop.counter is not None:
@@ -96,9 +101,9 @@ def _walk(
             if bad is None and (lengths < 0).any():
                 bad = int(np.argmax(lengths < 0))
             if bad is not None:
-                raise _bad_token(lines.raw[starts[bad] : ends[bad]], "list length", element, prop, first_line + bad)
+                raise _bad_token(lines.raw[starts[bad] : ends[bad]], "list length", element, prop, int(numbers[bad]))
             longest = stop - at
-            _require(lengths <= longest, lines, element, prop, first_line)
+            _require(lengths <= longest, lines, element, prop, numbers)
             at += lengths.astype(np.int64)
         elif prop.name in pieces:
             if prop.dtype.kind == "f":
@@ -107,23 +112,23 @@ def _walk(
                 values, bad = as_integers(lines.raw, starts, ends, prop.dtype)
             if bad is not None:
                 token = lines.raw[starts[bad] : ends[bad]]
-                raise _bad_token(token, prop.dtype.name, element, prop, first_line + bad)
+                raise _bad_token(token, prop.dtype.name, element, prop, int(numbers[bad]))
             pieces[prop.name].append((starts, ends, values))
     if (at != stop).any():
         row = int(np.argmax(at != stop))
         raise MalformedFile(
-            f"line {first_line + row}: a row of element {element.name} has {lines.counts[row]} values, "
+            f"line {numbers[row]}: a row of element {element.name} has {lines.counts[row]} values, "
             f"{int(stop[row] - at[row])} more than declared"
         )
 
 
 def _require(
-    there: npt.NDArray[np.bool_], lines: Lines, element: PlyElement, prop: PlyProperty, first_line: int
+    there: npt.NDArray[np.bool_], lines: Lines, element: PlyElement, prop: PlyProperty, numbers: _Offsets
 ) -> None:
     if not there.all():
         row = int(np.argmin(there))
         raise MalformedFile(
-            f"line {first_line + row}: a row of element {element.name} ends after {lines.counts[row]} values, "
+            f"line {numbers[row]}: a row of element {element.name} ends after {lines.counts[row]} values, "
             f"within property {prop.name}"
         )
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.errors import MalformedFile
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.positions import moved, number_text
 
 __all__ = ["Lines", "as_integers", "as_numbers", "blocks", "refuse_binary", "replaced", "shown"]
@@ -46,29 +46,35 @@ class Lines:
     def __len__(self) -> int:
         return len(self.line_starts)
 
-    def head(self, count: int) -> Lines:
-        """Return the first `count` lines only."""
-        return Lines(
-            self.raw, self.line_starts[:count], self.first[:count], self.counts[:count], self.starts, self.ends
-        )
-
     def pick(self, rows: npt.NDArray[Any]) -> Lines:
         """Return the lines that an index or mask of lines picks."""
         return Lines(self.raw, self.line_starts[rows], self.first[rows], self.counts[rows], self.starts, self.ends)
 
 
-def blocks(raw: bytes, begin: int, *, delimiter: bytes | None = None) -> Iterator[tuple[Lines, int]]:
+def blocks(
+    raw: bytes, begin: int, *, delimiter: bytes | None = None, longest: int | None = None
+) -> Iterator[tuple[Lines, int]]:
     """Yield the lines from byte `begin` on, block by block, each with the offset where the next block begins.
 
     Lines end in LF, CRLF or a lone CR.  Without a delimiter, tokens are runs of anything but white space; with one,
-    they are what stands between two delimiters, white space trimmed, and may be empty.
+    they are what stands between two delimiters, white space trimmed, and may be empty.  longest: bytes of a line that
+    does not fit into a block; raises UnsupportedCloud before memory is taken for a longer one.
     """
     while begin < len(raw):
-        end = raw.rfind(b"\n", begin, begin + BLOCK_BYTES) + 1
+        end = _last_end(raw, begin, begin + BLOCK_BYTES)
         if end == 0:
-            end = raw.find(b"\n", begin + BLOCK_BYTES) + 1 or len(raw)
+            end = raw.find(b"\n", begin + BLOCK_BYTES - 1) + 1 or len(raw)
+            end = raw.find(b"\r", begin + BLOCK_BYTES - 1, end - 2) + 1 or end
+            if longest is not None and end - begin > longest:
+                raise UnsupportedCloud(f"the line at byte {begin} has {end - begin} bytes; the limit is {longest}")
         yield _split(raw, begin, end, delimiter), end
         begin = end
+
+
+def _last_end(raw: bytes, begin: int, end: int) -> int:
+    """Return where the last line that ends within [begin, end) does, 0 if none does."""
+    # A CR that is the last byte looked at may be half of a CRLF.
+    return raw.rfind(b"\n", begin, end) + 1 or raw.rfind(b"\r", begin, end - 1) + 1
 
 
 def _split(raw: bytes, begin: int, end: int, delimiter: bytes | None) -> Lines:

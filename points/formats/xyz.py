@@ -1,4 +1,4 @@
-"""XYZ: one point a line of text, as scanners, spreadsheets and `.pts` files have it; only moved tokens change."""
+"""XYZ, CSV, PTS: one point a line of text, as scanners and spreadsheets have it; only moved tokens change."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,10 @@ from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import Lines, as_numbers, blocks, refuse_binary, replaced, shown
 
-__all__ = ["MAX_COLUMNS", "Xyz"]
+__all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
 
 MAX_COLUMNS = 4096
+MAX_LINE_BYTES = 1 << 23
 _COMMENTS = (b"#", b"//")
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
@@ -45,8 +46,13 @@ class Layout:
 
 @dataclass(frozen=True)
 class XyzSource:
-    """Hold the whole file, the (N, 3) byte offsets of its position tokens, and the positions read from them."""
+    """Hold the whole file, the (N, 3) byte offsets of its position tokens, and the positions read from them.
 
+    format: the name of the one that it was read as.
+    """
+
+    format: str
+    layout: Layout
     raw: bytes
     starts: _Offsets
     ends: _Offsets
@@ -61,9 +67,11 @@ class Xyz(Format):
     """
 
     name = "xyz"
-    suffixes = (".xyz", ".txt", ".asc", ".csv", ".pts")
+    suffixes: ClassVar[tuple[str, ...]] = (".xyz", ".txt", ".asc")
     media_type = "text/plain"
     has_magic = False
+    delimiter: ClassVar[bytes | None] = None  # of a new file; None for a space
+    is_counted: ClassVar[bool] = False  # a new file begins with the number of points
 
     def sniff(self, head: bytes) -> bool:
         """Recognise nothing: text has no magic, its suffix says what it is."""
@@ -81,15 +89,35 @@ class Xyz(Format):
             raise MalformedFile(f"the file declares {layout.declared} points and holds {len(starts)}")
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
         attributes = {layout.names[column]: values for column, values in columns.items()}
-        return PointCloud(xyz, attributes, XyzSource(raw, starts, ends, xyz.copy()))
+        return PointCloud(xyz, attributes, XyzSource(self.name, layout, raw, starts, ends, xyz.copy()))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
-        """Write the file that was read with the moved positions replaced, or a new one."""
+        """Write the file that was read with the moved positions replaced, or a new one if it is laid out otherwise."""
         source = cloud.source
-        if isinstance(source, XyzSource):
+        if isinstance(source, XyzSource) and (source.format == self.name or self._has_layout(source.layout)):
             path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
         else:
-            path.write_bytes(_new_file(cloud, path.suffix.lower()))
+            path.write_bytes(_new_file(cloud, self.delimiter, self.is_counted))
+
+    def _has_layout(self, layout: Layout) -> bool:
+        return layout.delimiter == self.delimiter and (layout.declared is not None) == self.is_counted
+
+
+class Csv(Xyz):
+    """Do as `Xyz`; a new table has commas, and names above if there are attributes."""
+
+    name = "csv"
+    suffixes = (".csv",)
+    media_type = "text/csv"
+    delimiter = b","
+
+
+class Pts(Xyz):
+    """Do as `Xyz`; a new table has the number of points above."""
+
+    name = "pts"
+    suffixes = (".pts",)
+    is_counted = True
 
 
 def _layout(raw: bytes) -> Layout:
@@ -119,7 +147,7 @@ def _described(begin: int, line: int, declared: int | None, row: bytes, names: b
     if columns < 3:
         raise MalformedFile(f"line {line} has {columns} columns, a point needs three: {shown(row)}")
     if columns > MAX_COLUMNS:
-        raise UnsupportedCloud(f"line {line} has {columns} columns; the limit is {MAX_COLUMNS}")
+        raise UnsupportedCloud(f"line {line} has more than {MAX_COLUMNS} columns, the limit")
     labels = [f"column_{column + 1}" for column in range(columns)]
     axes = (0, 1, 2)
     for text in (names, remark):
@@ -137,7 +165,8 @@ def _delimiter(row: bytes) -> bytes | None:
 
 
 def _words(row: bytes) -> list[bytes]:
-    return [word.strip() for word in row.split(_delimiter(row))] if row else []
+    """Split a row; what is beyond the limit stays together as one more word."""
+    return [word.strip() for word in row.split(_delimiter(row), MAX_COLUMNS)] if row else []
 
 
 def _are_names(words: Sequence[bytes]) -> bool:
@@ -159,7 +188,7 @@ def _table(
     starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
     parts: dict[int, list[npt.NDArray[np.float64]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
     line, count = layout.line, 0
-    for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter):
+    for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter, longest=MAX_LINE_BYTES):
         rows = np.flatnonzero(_is_row(lines))
         table, numbers = lines.pick(rows), line + rows
         line, count = line + len(lines), count + len(rows)
@@ -199,18 +228,19 @@ def _check_columns(table: Lines, numbers: npt.NDArray[np.int64], columns: int) -
         raise MalformedFile(f"line {numbers[row]} has {table.counts[row]} columns, the lines before have {columns}")
 
 
-def _new_file(cloud: PointCloud, suffix: str) -> bytes:
+def _new_file(cloud: PointCloud, delimiter: bytes | None, is_counted: bool) -> bytes:
     """Write x, y, z and every numeric attribute; their names stand above if there are any."""
     columns: dict[str, npt.NDArray[Any]] = {axis: cloud.xyz[:, index] for index, axis in enumerate(AXES)}
     columns |= scalar_columns(cloud.attributes, _TYPES, taken=AXES)
-    separator = "," if suffix == ".csv" else " "
-    lines: list[str] = [str(len(cloud))] if suffix == ".pts" else []
+    separator = " " if delimiter is None else delimiter.decode()
+    lines: list[str] = [str(len(cloud))] if is_counted else []
     if len(columns) > 3:
-        lines.append(("" if suffix == ".csv" else "# ") + separator.join(columns))
+        lines.append(("# " if delimiter is None else "") + separator.join(columns))
     lines += map(separator.join, zip(*(_texts(values) for values in columns.values()), strict=True))
     return "\n".join([*lines, ""]).encode() if lines else b""
 
 
 def _texts(values: npt.NDArray[Any]) -> list[str]:
     """Write (N,) numbers as the shortest texts that read back as the same numbers of their type."""
-    return values.astype(str).tolist() if values.dtype == np.float32 else list(map(repr, values.tolist()))
+    texts = values.astype(str).tolist() if values.dtype == np.float32 else map(repr, values.tolist())
+    return [text.removesuffix(".0") for text in texts]  # a label stays a whole number

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+import socket
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from typer.testing import CliRunner
 import straightpcf
 from straightpcf.clients.cli import app
 from straightpcf.clients.console import EXIT_CODES, exit_code
+from straightpcf.clients.doctor import EXTRAS
 from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
@@ -114,6 +118,16 @@ def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
     assert "data_dir" in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.parametrize("option", ["--port", "--grpc-port"])
+def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        done = cli("serve", "--port", "0", option, str(port), "--device", "cpu", "--data-dir", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"error [invalid_options]: {option[2:].replace('-', '_')} is {port}")
+    assert "Started server process" not in done.stderr
+
+
 def test_info_describes_a_file(scan: Path) -> None:
     xyz = np.load(scan)
     xyz[7] = np.nan
@@ -138,6 +152,15 @@ def test_doctor_tells_what_is_here() -> None:
     findings = json.loads(done.stdout)
     assert {"python", "extras"} <= set(findings)
     assert done.exit_code == (4 if "problem" in findings else 0)
+
+
+def test_doctor_looks_for_what_pyproject_asks_for() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    for extra, packages in EXTRAS.items():
+        names = [re.split(r"[<>=;\s\[]", text)[0] for text in extras[extra]]
+        assert packages == tuple(name for name in names if name != "straightpcf")
+    assert set(EXTRAS) == set(extras) - {"train", "benchmarks", "dev"}
 
 
 def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

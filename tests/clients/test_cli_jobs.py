@@ -97,6 +97,52 @@ def test_a_dash_is_stdin_and_stdout(server: RunningServer, scan: Path, remote: b
     assert len(as_text.stdout.splitlines()) == POINTS
 
 
+@pytest.mark.parametrize("remote", [False, True])
+def test_text_on_stdin_is_known_by_the_name_that_is_given(server: RunningServer, tmp_path: Path, remote: bool) -> None:
+    np.savetxt(scan := tmp_path / "scan.xyz", noisy(torus(POINTS), 0.01))
+    where = ("--url", server.url) if remote else ("--device", "cpu")
+    target, piped = tmp_path / "clean.csv", tmp_path / "piped.csv"
+    assert cli(None, "denoise", scan, target, "--iterations", 1, *where).returncode == 0
+    assert b"," in target.read_bytes().splitlines()[0]
+    named = ("--name", "a.xyz", "--iterations", 1)
+    done = cli(None, "denoise", "-", piped, *named, *where, stdin=scan.read_bytes())
+    assert done.returncode == 0, done.stderr
+    assert piped.read_bytes() == target.read_bytes()
+    done = cli(None, "denoise", "-", "-", *named, *where, stdin=scan.read_bytes())
+    assert len(done.stdout.splitlines()) == POINTS
+    assert b"," not in done.stdout
+    done = cli(None, "denoise", "-", piped, *where, stdin=scan.read_bytes())
+    assert (done.returncode, done.stderr.count(b"\n")) == (3, 1)
+    assert b"error [unknown_format]: the cloud begins with" in done.stderr
+
+
+def test_submit_takes_text_from_stdin_with_its_name(server: RunningServer) -> None:
+    text = b"".join(b"%f %f %f\n" % tuple(point) for point in noisy(torus(POINTS), 0.01))
+    id = cli(server, "submit", "-", "--name", "piped.txt", "--iterations", 1, stdin=text).stdout.decode().strip()
+    assert cli(server, "wait", id).returncode == 0
+    assert json.loads(cli(server, "status", id, "--json").stdout)["name"] == "piped.txt"
+    assert cli(server, "submit", "-", stdin=text).returncode == 3
+    assert cli(server, "submit", "a.xyz", "b.xyz", "--name", "c.xyz").returncode == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_denoise_that_is_ended_takes_its_job_along(server: RunningServer, tmp_path: Path, number: int) -> None:
+    np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]
+    process = subprocess.Popen([*command, "--url", server.url], env=clean_environment(), stderr=subprocess.DEVNULL)
+    wait_for(lambda: b"processing" in cli(server, "jobs").stdout)
+    process.send_signal(number)
+    assert process.wait(timeout=20) == 130
+    assert cli(server, "jobs").stdout == b""
+    assert list(tmp_path.iterdir()) == [large]
+
+
+def test_a_key_that_no_header_can_carry_is_a_usage_error(server: RunningServer) -> None:
+    done = cli(server, "jobs", "--api-key", "ключ")
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
+    assert b"error [invalid_options]" in done.stderr
+
+
 def test_watch_once_does_what_is_there_and_tells_what_failed(scan: Path) -> None:
     np.save(scan.with_name("few.npy"), sphere(5))
     (scan.parent / "notes.md").write_text("no cloud")
@@ -121,3 +167,16 @@ def test_watch_takes_what_comes_later_from_a_server(server: RunningServer, scan:
         os.kill(process.pid, signal.SIGINT)
         process.wait(timeout=20)
     assert process.returncode == 130
+
+
+def test_the_readme_downloads_a_result_with_curl_and_goes_on_with_half_of_it(server: RunningServer, scan: Path) -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (line,) = (line for line in readme.splitlines() if line.startswith("curl -C -"))
+    id = cli(server, "submit", scan, "--iterations", 1).stdout.decode().strip()
+    assert cli(server, "wait", id).returncode == 0
+    command = line.replace("http://127.0.0.1:8000", server.url).replace("curl", "curl -sf", 1)
+    clean = scan.with_name("clean.ply")
+    for _ in range(2):
+        subprocess.run(command, shell=True, check=True, cwd=scan.parent, env={**os.environ, "ID": id}, timeout=20)
+        assert np.load(clean).shape == (POINTS, 3)
+        clean.write_bytes(clean.read_bytes()[:1000])

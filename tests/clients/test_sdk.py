@@ -109,6 +109,7 @@ def test_the_async_client_gives_what_the_sync_one_gives(server: RunningServer, s
         async with AsyncClient(server.url) as client:
             assert (await client.health()).ready
             assert (await client.info()).version
+            assert (await client.denoise(b"1 2 3\n" + b"4 5 6\n" * 99, name="a.xyz", iterations=1)).points == 100
             one, two = await asyncio.gather(
                 client.denoise(scan, tmp_path / "clean.npy", iterations=1), client.denoise(np.load(scan), iterations=1)
             )

@@ -7,6 +7,7 @@ import hashlib
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import repeat
 from pathlib import Path
@@ -19,11 +20,13 @@ from straightpcf.clients.sdk import AsyncClient, Client, Completed, Output, Prev
 from straightpcf.points.errors import (
     ConnectionFailed,
     IdConflict,
+    InvalidOptions,
     InvalidRequest,
     JobCanceled,
     JobNotFinished,
     NotFound,
     TooFewPoints,
+    UnknownFormat,
 )
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
@@ -118,6 +121,61 @@ def test_a_wait_that_is_too_short_ends_and_a_denoise_takes_its_job_along(client:
     with pytest.raises(JobNotFinished):
         client.denoise(LARGE, iterations=1, timeout=0.3)
     assert not list(client.jobs.list(states=["queued", "starting", "processing"]))
+
+
+def test_a_short_timeout_is_no_limit_to_a_job_that_waits_its_turn(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+
+    async def there() -> int:
+        async with AsyncClient(url, timeout=0.5) as client:
+            return (await client.denoise(SMALL, iterations=1)).points
+
+    with Client(url) as patient, Client(url, timeout=0.5) as hasty, ThreadPoolExecutor() as pool:
+        first = patient.jobs.create(LARGE, iterations=3)
+        threading.Timer(3.5, first.cancel).start()
+        others = [
+            pool.submit(lambda: hasty.denoise(SMALL, iterations=1).points),
+            pool.submit(lambda: hasty.denoise(SMALL, iterations=1, on_progress=lambda _: None).points),
+            pool.submit(lambda: sum(len(frame.indices) for frame in hasty.jobs.create(SMALL, iterations=1).patches())),
+            pool.submit(asyncio.run, there()),
+        ]
+        assert [other.result(timeout=60) for other in others] == [400, 400, 400, 400]
+
+
+@pytest.mark.parametrize(("suffix", "first"), [("csv", b","), ("pts", b"400\n")])
+def test_text_of_every_kind_comes_from_a_server_as_its_suffix_says(
+    client: Client, tmp_path: Path, suffix: str, first: bytes
+) -> None:
+    np.savetxt(source := tmp_path / "in.txt", SMALL, delimiter=";")
+    target = tmp_path / f"clean.{suffix}"
+    for cloud in (SMALL, source):
+        result = client.denoise(cloud, target, iterations=1)
+        assert first in target.read_bytes().partition(b"\n")[0] + b"\n"
+        assert b";" not in target.read_bytes()
+        assert result.xyz.shape == SMALL.shape
+        assert result.filename.endswith(suffix)
+
+
+def test_the_bytes_of_a_text_file_need_a_name(client: Client, tmp_path: Path) -> None:
+    np.savetxt(path := tmp_path / "scan.xyz", SMALL)
+    raw = path.read_bytes()
+    by_path = client.denoise(path, iterations=1)
+    assert client.denoise(raw, name="scan.xyz", iterations=1).content == by_path.content
+    frame = np.hstack([SMALL, np.ones((400, 1))]).astype("<f4").tobytes()
+    assert client.denoise(frame, name="frame.bin", iterations=1).points == 400
+    with pytest.raises(UnknownFormat, match="needs a name"):
+        client.jobs.create(raw)
+    assert not list(client.jobs.list())
+
+
+def test_what_no_header_can_carry_is_refused_by_its_class(url: str) -> None:
+    for key in ("ключ", "a\nb", "naïve"):
+        with pytest.raises(InvalidOptions, match="ASCII"):
+            Client(url, api_key=key)
+        with pytest.raises(InvalidOptions, match="ASCII"):
+            AsyncClient(url, api_key=key)
+        with Client(url) as client, pytest.raises(InvalidRequest, match="ASCII"):
+            client.jobs.create(SMALL, idempotency_key=key)
 
 
 def test_a_failed_job_raises_the_class_of_its_code(client: Client) -> None:

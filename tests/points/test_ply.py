@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,30 @@ def test_a_new_file_has_double_positions_and_its_attributes_typed(tmp_path: Path
     np.testing.assert_array_equal(np.stack([vertex[axis] for axis in "xyz"], axis=1), xyz)
     assert vertex["normal_2"].dtype == np.float32
     np.testing.assert_array_equal(vertex["my_label"], np.arange(9))
+
+
+def test_blank_lines_between_rows_are_passed_over_and_kept(tmp_path: Path) -> None:
+    head = header(ASCII, "element mark 2", "element vertex 2", *AXES, "element face 1", "property list uchar int i")
+    raw = head + b"\n\n\n1 2 3\n \t\n\r\n4 5 6\n\n3 0 1 1\n\n"  # the first two are the rows of `mark`
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [4, 5, 6]])
+    assert written(tmp_path, cloud) == raw
+    xyz = cloud.xyz.copy()
+    xyz[1, 1] = 5.5
+    assert written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"4 5 6", b"4 5.5 6")
+    with pytest.raises(MalformedFile, match=r"line 19: .* ends after 3 values, within property i"):
+        read(tmp_path, raw.replace(b"3 0 1 1", b"3 0 1"))
+
+
+def test_a_header_of_very_many_elements_is_refused_at_once(tmp_path: Path) -> None:
+    began = time.monotonic()
+    with pytest.raises(UnsupportedCloud, match=r"more than 1024 elements"):
+        read(tmp_path, header(ASCII, *VERTICES, *(f"element e{number} 0" for number in range(40_000))))
+    properties = [f"property char {number}" for number in range(4000)]
+    elements = [line for number in range(12) for line in (f"element {number} 0", *properties)]
+    with pytest.raises(MalformedFile, match=r"no property x"):
+        read(tmp_path, header(ASCII, *elements, VERTICES[0]))
+    assert time.monotonic() - began < 5
 
 
 VERTICES = ("element vertex 4", *AXES)

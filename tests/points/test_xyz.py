@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile, TooManyPoints, UnknownFormat
-from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from straightpcf.points.errors import MalformedFile, TooManyPoints, UnknownFormat, UnsupportedCloud
+from straightpcf.points.formats import format_for, format_named, read_cloud, text, write_cloud
 from tests.clouds import torus
 
 
@@ -21,7 +22,7 @@ def read(folder: Path, raw: bytes, filename: str = "a.xyz", **options: Any) -> P
 
 
 def written(folder: Path, cloud: PointCloud, name: str = "out.xyz") -> bytes:
-    write_cloud(cloud, folder / name, format_named("xyz"))
+    write_cloud(cloud, folder / name, format_for(name))
     return (folder / name).read_bytes()
 
 
@@ -88,6 +89,25 @@ def test_a_new_table_names_its_columns(tmp_path: Path) -> None:
         assert list(again.attributes) == ["scan_id", "w"]
 
 
+@pytest.mark.parametrize(
+    ("source", "raw", "target", "expected"),
+    [
+        ("a.xyz", b"1 2 3 7\n4 5.50 6 0.5\n", "csv", b"x,y,z,column_4\n1,2,3,7\n4,5.5,6,0.5\n"),
+        ("a.xyz", b"# made\n1 2 3\n4 5 6\n", "pts", b"2\n1 2 3\n4 5 6\n"),
+        ("a.csv", b"z,y,x,id\n3,2,1,tree\n6,5,4,house\n", "xyz", b"1 2 3\n4 5 6\n"),
+        ("a.pts", b"1\n1 2 3 9\n", "xyz", b"# x y z column_4\n1 2 3 9\n"),
+        ("a.txt", b"X,Y,Z\n1.00, 2,3\n", "csv", b"X,Y,Z\n1.00, 2,3\n"),  # it has the layout
+        ("a.csv", b"1;2.0;3\n", "csv", b"1;2.0;3\n"),  # nothing else was asked for
+        ("a.asc", b"2\n1 2 3.0 x\n4 5 6 y\n", "pts", b"2\n1 2 3.0 x\n4 5 6 y\n"),
+    ],
+)
+def test_a_table_is_written_anew_only_where_another_layout_is_wanted(
+    source: str, raw: bytes, target: str, expected: bytes, tmp_path: Path
+) -> None:
+    write_cloud(read(tmp_path, raw, source), tmp_path / "result-1", format_named(target))
+    assert (tmp_path / "result-1").read_bytes() == expected
+
+
 MALFORMED = {
     "bad token": (b"1 2 3\n4 5 6\n\n7 8,9 0\n", r"line 4, column 2.*8,9"),
     "a name among numbers": (b"x y z\n1 2 3\n1 z 3\n", r"line 3, column 2.*z"),
@@ -130,3 +150,22 @@ def test_errors_far_down_a_long_file_are_found(tmp_path: Path) -> None:
     with pytest.raises(MalformedFile, match=r"line 800001, column 3.*oops"):
         read(tmp_path, raw + b"1 2 oops\n")
     assert time.monotonic() - began < 20
+
+
+@pytest.mark.parametrize("above", [b"", b"1 2 3\n"])
+def test_one_endless_line_is_refused_before_it_takes_memory(above: bytes, tmp_path: Path) -> None:
+    (path := tmp_path / "a.xyz").write_bytes(above + b"1 " * 5_000_000)
+    tracemalloc.start()
+    with pytest.raises(UnsupportedCloud, match=r"limit"):
+        read_cloud(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * path.stat().st_size
+
+
+def test_every_kind_of_line_end_falls_anywhere_in_a_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for end in (b"\n", b"\r\n", b"\r"):
+        raw = end.join(b"%d 2 3" % 10**row for row in range(12)) + end
+        for size in range(2, 40):
+            monkeypatch.setattr(text, "BLOCK_BYTES", size)
+            assert read(tmp_path, raw).xyz[:, 0].tolist() == [10**row for row in range(12)]

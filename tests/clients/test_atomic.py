@@ -1,0 +1,61 @@
+"""Files are replaced as a whole, and stay what they were: their mode, a link."""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from straightpcf.clients.atomic import replaced_when_complete
+
+
+def write(path: Path, content: bytes) -> None:
+    with replaced_when_complete(path) as unfinished:
+        unfinished.write_bytes(content)
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.mark.parametrize("kept", [0o600, 0o640, 0o444])
+def test_a_replaced_file_keeps_its_mode_and_is_never_open_to_more(kept: int, tmp_path: Path) -> None:
+    (path := tmp_path / "a.ply").write_bytes(b"old")
+    path.chmod(kept)
+    with replaced_when_complete(path) as unfinished:
+        assert mode(unfinished) == kept | stat.S_IWUSR
+        unfinished.write_bytes(b"new")
+    assert (path.read_bytes(), mode(path)) == (b"new", kept)
+
+
+def test_a_new_file_has_the_mode_of_any_new_file(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write(tmp_path / "a.ply", b"new")
+    finally:
+        os.umask(before)
+    assert mode(tmp_path / "a.ply") == 0o640
+
+
+def test_a_link_stays_one_and_what_it_points_to_is_replaced(tmp_path: Path) -> None:
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    (elsewhere / "real.ply").write_bytes(b"old")
+    (link := tmp_path / "a.ply").symlink_to("elsewhere/real.ply")
+    write(link, b"new")
+    assert link.is_symlink()
+    assert (elsewhere / "real.ply").read_bytes() == b"new"
+    (dangling := tmp_path / "b.ply").symlink_to("elsewhere/none.ply")
+    write(dangling, b"first")
+    assert (elsewhere / "none.ply").read_bytes() == b"first"
+
+
+def test_a_block_that_fails_changes_and_leaves_nothing(tmp_path: Path) -> None:
+    (path := tmp_path / "a.ply").write_bytes(b"old")
+    with suppress(KeyboardInterrupt), replaced_when_complete(path) as unfinished:
+        unfinished.write_bytes(b"half")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,157 @@
+"""What `watch` takes, leaves and takes again."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from straightpcf.clients import watch
+from straightpcf.clients.sdk import Client, retry
+from straightpcf.clients.watch import watch_folder
+from straightpcf.points.errors import ConnectionFailed, MalformedFile, ServerBusy
+from tests.clouds import torus
+from tests.conftest import RunningServer
+
+Denoise = Callable[[Path, Path], Any]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    deadline, sleep = time.monotonic() + 30, time.sleep
+
+    def look_again(seconds: float) -> None:
+        assert time.monotonic() < deadline, "nothing more comes"
+        sleep(seconds)
+
+    monkeypatch.setattr(watch, "LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(watch, "time", SimpleNamespace(sleep=look_again))
+    (tmp_path / "clean").mkdir()
+    (tmp_path / "scan.ply").write_bytes(b"first")
+    return tmp_path
+
+
+def copy(source: Path, target: Path) -> str:
+    target.write_bytes(source.read_bytes())
+    return source.read_text()
+
+
+def watched(folder: Path, denoise: Denoise) -> Iterator[Any]:
+    return (outcome for _, outcome in watch_folder(folder, folder / "clean", denoise))
+
+
+def once(folder: Path, denoise: Denoise = copy) -> list[Any]:
+    return [outcome for _, outcome in watch_folder(folder, folder / "clean", denoise, once=True)]
+
+
+def replace(path: Path, content: bytes, *, age: float) -> None:
+    """Put another file in the place of one, as `mv` does: with a time of its own."""
+    (new := path.with_name("new")).write_bytes(content)
+    written = path.stat().st_mtime_ns - round(age * 1e9)
+    os.utime(new, ns=(written, written))
+    new.replace(path)
+
+
+@pytest.mark.parametrize("age", [-5.0, 5.0])
+def test_a_file_that_is_replaced_while_it_is_worked_on_is_done_again(folder: Path, age: float) -> None:
+    def slowly(source: Path, target: Path) -> str:
+        done = copy(source, target)
+        if done == "first":
+            replace(source, b"second", age=age)
+        return done
+
+    outcomes = watched(folder, slowly)
+    assert [next(outcomes), next(outcomes)] == ["first", "second"]
+    assert (folder / "clean" / "scan.ply").read_bytes() == b"second"
+    assert once(folder) == []
+
+
+def test_what_is_done_stays_done_for_the_next_process_until_it_changes(folder: Path) -> None:
+    assert once(folder) == ["first"]
+    assert once(folder) == []
+    replace(folder / "scan.ply", b"an older one", age=3600.0)
+    assert once(folder) == ["an older one"]
+
+
+def test_a_file_system_that_keeps_no_exact_times_does_not_make_it_go_on_for_ever(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "utime", lambda path, ns: None)
+    asked: list[str] = []
+    seen = watched(folder, lambda source, target: asked.append(copy(source, target)))
+    threading.Timer(0.3, lambda: (folder / "late.ply").write_bytes(b"late")).start()
+    next(seen), next(seen)
+    assert asked == ["first", "late"]
+
+
+@pytest.mark.parametrize("away", [ConnectionFailed("down"), ServerBusy("full")])
+def test_a_server_that_cannot_be_had_is_no_failure_of_the_file(folder: Path, away: Exception) -> None:
+    answers = iter([away, away, None])
+
+    def denoise(source: Path, target: Path) -> str:
+        if (error := next(answers)) is not None:
+            raise error
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert [next(outcomes) for _ in range(3)] == [away, away, "first"]
+
+
+def test_a_server_that_comes_later_gets_what_was_put_there_before(
+    server: RunningServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    np.save(folder / "scan.npy", torus(400))
+    (folder / "scan.ply").unlink()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))  # taken, and nobody listens
+        with Client(f"http://127.0.0.1:{listener.getsockname()[1]}") as client:
+            outcomes = watched(folder, lambda source, target: client.denoise(source, target, iterations=1))
+            assert isinstance(next(outcomes), ConnectionFailed)
+            listener.listen()
+            threading.Thread(target=forward, args=(listener, server.url), daemon=True).start()
+            results = (outcome for outcome in outcomes if not isinstance(outcome, ConnectionFailed))
+            assert next(results).points == 400
+    assert np.load(folder / "clean" / "scan.npy").shape == (400, 3)
+
+
+def forward(listener: socket.socket, url: str) -> None:
+    """Pass connections on, until the listener is closed."""
+    host, port = url.removeprefix("http://").split(":")
+    with suppress(OSError):
+        while True:
+            here, _ = listener.accept()
+            there = socket.create_connection((host, int(port)))
+            for source, sink in ((here, there), (there, here)):
+                threading.Thread(target=copy_bytes, args=(source, sink), daemon=True).start()
+
+
+def copy_bytes(source: socket.socket, sink: socket.socket) -> None:
+    with suppress(OSError), sink:
+        while data := source.recv(65536):
+            sink.sendall(data)
+
+
+def test_a_file_that_fails_is_tried_again_only_when_it_changes(folder: Path) -> None:
+    asked: list[str] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(source.read_text())
+        if asked[-1] == "first":
+            raise MalformedFile("broken")
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert isinstance(next(outcomes), MalformedFile)
+    threading.Timer(0.3, lambda: replace(folder / "scan.ply", b"second", age=-5.0)).start()
+    assert next(outcomes) == "second"
+    assert asked == ["first", "second"]
