@@ -23,13 +23,18 @@ __all__ = [
     "EARLIEST",
     "FIRST_NOISE",
     "FIRST_PASSES",
+    "HEAVY_TAILED",
     "NEAR_SHARE",
     "NEAR_WEIGHT",
     "NOISE_STD",
+    "OTHER_NOISE",
     "PATCH_SIZE",
     "REACH",
     "SCALES",
+    "STRETCH",
+    "TAILS",
     "TOUCH_UNTIL",
+    "UNEQUAL",
     "VALIDATION_EVERY",
     "Batch",
     "PatchSource",
@@ -47,7 +52,13 @@ SCALES = (0.8, 1.2)  # augmentation
 # in the size that goes with it (`zoom_of`). The others are shown as later passes see them, with t in [0, 1).
 FIRST_PASSES = 0.5
 # Somewhat smaller than the filter shows them: training with more noise than this loses thin walls (docs/training.md).
-_SHOWN_NOISE, _SMALLEST_ZOOM = 0.024, 0.8
+_SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
+# The share of patches whose noise is not the paper's. Of these, some are heavy-tailed: each point's variance is drawn
+# from a gamma distribution of mean 1 (shape 1 makes a multivariate Laplace distribution, less makes heavier tails). And
+# some have unequal axes: their stds are lognormal.
+OTHER_NOISE = 0.25
+HEAVY_TAILED, TAILS = 0.7, (0.6, 2.0)
+UNEQUAL, STRETCH = 0.4, 0.4
 # Their noise, in radii of the cloud's bounding sphere.
 FIRST_NOISE = 0.03 * (np.arange(60) + 0.5) / 60
 _RADII = 200  # patches of a cloud that are measured
@@ -228,7 +239,7 @@ class PatchSource:
             time = max(EARLIEST, 1 - scale * FIRST_NOISE[level] / NOISE_STD)
         else:
             time = rng.uniform(0, 1)
-        here = clean + (1 - time) * NOISE_STD / scale * rng.standard_normal(clean.shape)
+        here = clean + (1 - time) * NOISE_STD / scale * _noise(rng, len(clean))
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
         distance = np.square(here - origin).sum(axis=1)
@@ -246,6 +257,20 @@ class PatchSource:
         noisy = (here - time * clean) / (1 - time)
         placed = [(points - origin) @ transform for points in (noisy, clean, drawn, surface)]
         return placed[0], placed[1], np.array([[time]]), placed[2], placed[3], normals @ transform / scale
+
+
+def _noise(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
+    """Draw noise of std 1 for the points of one patch, (count, 3): the paper's, or another (`OTHER_NOISE`)."""
+    noise = rng.standard_normal((count, 3))
+    if rng.random() >= OTHER_NOISE:
+        return noise
+    if rng.random() < HEAVY_TAILED:
+        shape = rng.uniform(*TAILS)
+        noise *= np.sqrt(rng.gamma(shape, 1 / shape, (count, 1)))
+    if rng.random() < UNEQUAL:
+        stds = np.exp(STRETCH * rng.standard_normal(3))
+        noise = noise * (stds / np.sqrt(np.square(stds).mean())) @ Rotation.random(random_state=rng).as_matrix()
+    return noise
 
 
 def gathered(points: torch.Tensor, index: torch.Tensor) -> torch.Tensor:

@@ -14,13 +14,18 @@ from straightpcf.model.train.data import (
     EARLIEST,
     FIRST_NOISE,
     FIRST_PASSES,
+    HEAVY_TAILED,
     NEAR_SHARE,
     NEAR_WEIGHT,
     NOISE_STD,
+    OTHER_NOISE,
     PATCH_SIZE,
     REACH,
     SCALES,
+    STRETCH,
+    TAILS,
     TOUCH_UNTIL,
+    UNEQUAL,
     Batch,
     PatchSource,
     gathered,
@@ -60,7 +65,7 @@ class DevicePatchSource:
         near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
         clean = gathered(clouds, near)
         time, scale = self._shown(which)
-        noisy = clean + NOISE_STD / scale * torch.randn_like(clean)
+        noisy = clean + NOISE_STD / scale * _noise(*clean.shape[:2], device)
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
         squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does
@@ -97,6 +102,18 @@ class DevicePatchSource:
         places = torch.linspace(0, 1, AROUND, device=squared.device) * (self._reach[which, None] - 1)
         near = near.gather(1, places.long())
         return gathered(surface, near), gathered(normals, near)
+
+
+def _noise(batch_size: int, count: int, device: torch.device) -> torch.Tensor:
+    """Draw noise of std 1, (B, count, 3), of the kinds that `PatchSource` draws, a kind for each patch."""
+    noise = torch.randn(batch_size, count, 3, device=device)
+    other, heavy, unequal, shape = torch.rand(4, batch_size, 1, 1, device=device)
+    shape = TAILS[0] + (TAILS[1] - TAILS[0]) * shape
+    variance = torch._standard_gamma(shape.expand(-1, count, -1)) / shape
+    noise = torch.where((other < OTHER_NOISE) & (heavy < HEAVY_TAILED), noise * variance.sqrt(), noise)
+    stds = (STRETCH * torch.randn(batch_size, 1, 3, device=device)).exp()
+    stretched = noise * stds / stds.square().mean(dim=2, keepdim=True).sqrt() @ random_rotations(batch_size, device)
+    return torch.where((other < OTHER_NOISE) & (unequal < UNEQUAL), stretched, noise)
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:

@@ -108,6 +108,21 @@ def test_paths_are_taken_up_before_their_start_too(data: Path, *, on_device: boo
 
 
 @pytest.mark.parametrize("on_device", [False, True])
+def test_a_quarter_of_the_patches_has_noise_of_other_shapes_and_the_same_size(*, on_device: bool) -> None:
+    # Points of a plane are nearest to their feet, so across it y - x_t is the noise itself.
+    plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
+    batch = drawn(PatchSource([[plane]]), 256, on_device=on_device)
+    noise = (batch.at(batch.time) - batch.clean) / (NOISE_STD * (1 - batch.time))
+    assert noise.square().mean() == pytest.approx(1, abs=0.05)
+    stds = noise.std(dim=1)
+    unequal = stds.amax(dim=1) / stds.amin(dim=1) > 1.25
+    assert 0.03 < unequal.float().mean() < 0.25
+    length = (noise / stds[:, None]).square().sum(dim=2)  # of mean 3, and for Gaussian noise of variance 6
+    heavy = length.var(dim=1) > 9
+    assert 0.08 < heavy.float().mean() < 0.3
+
+
+@pytest.mark.parametrize("on_device", [False, True])
 def test_half_of_the_patches_are_in_the_sizes_of_a_first_pass(*, on_device: bool) -> None:
     # Of this plane 1000 points lie within 0.18 radii of it; a first pass shows that up to 2.5 times larger.
     plane = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32) * [1, 1, 0]
