@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from straightpcf.model.patches import Patches
 
@@ -41,5 +42,5 @@ def _areas(points: npt.NDArray[np.float64], inner: int, step: int) -> npt.NDArra
     """
     middle = np.square(points - points.mean(axis=0)).sum(axis=1)
     some = points[np.argsort(middle)[:inner:step]]
-    squared = np.square(some[:, None] - points).sum(axis=2)
-    return np.partition(squared, (_FEW, _MANY), axis=1)[:, [_FEW, _MANY]]
+    distances: npt.NDArray[np.float64] = cKDTree(points).query(some, k=[_FEW + 1, _MANY + 1])[0]  # with itself
+    return np.square(distances)

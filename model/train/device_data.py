@@ -65,7 +65,7 @@ class DevicePatchSource:
         near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
         clean = gathered(clouds, near)
         time, scale = self._shown(which)
-        noisy = clean + NOISE_STD / scale * _noise(*clean.shape[:2], device)
+        noisy = clean + NOISE_STD / scale * _noise(batch_size, clean.shape[1], device)
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
         squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does
