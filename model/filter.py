@@ -21,6 +21,7 @@ from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
+from straightpcf.model.outliers import FAR_OUT, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
 from straightpcf.model.restraint import across, reaches, restrained
@@ -38,11 +39,9 @@ COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RE
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
-# A row so many times as far out as half of the rows are is no point of the cloud: a file's sign for "no data". With it,
-# float64 would hold all others in one place.
-_FAR_OUT, _SOME = 1e12, 10_000
 # Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/training.md, "Few points").
 _FEW_POINTS = 500
+_FEWEST_APART = 100  # points among which one may lie apart
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 
 
@@ -68,7 +67,7 @@ class DenoiseResult:
 
     xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
     distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not finite,
-    or so far out that they can be no points, and passed through.
+    or so far out or alone that they belong to nothing, and passed through.
     """
 
     xyz: npt.NDArray[np.float64]
@@ -217,18 +216,32 @@ class Run:
         self.filter, self.options, self.xyz = owner, options, xyz
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
-        self.rows = self.rows[~_far_out(xyz[self.rows])]
+        self.rows = self.rows[~far_out(xyz[self.rows])]
         self.far_out = len(xyz) - self.not_finite - len(self.rows)
         if len(self.rows) < MIN_POINTS:
             others = f"{self.not_finite} not finite, {self.far_out} far out"
             raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
-        cloud = xyz if len(self.rows) == len(xyz) else xyz[self.rows]
-        self.frame = CloudFrame.of(cloud)
-        self.points = _Distinct(cloud)
+        self._take(xyz if len(self.rows) == len(xyz) else xyz[self.rows])
+        apart = self._apart()
+        self.apart = int(apart.sum())
+        if self.apart:
+            self.rows = self.rows[~apart]
+            self._take(xyz[self.rows])
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.readings: list[Reading] = []  # before each pass, and after the last
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
+
+    def _take(self, cloud: npt.NDArray[np.float64]) -> None:
+        self.frame = CloudFrame.of(cloud)
+        self.points = _Distinct(cloud)
+
+    def _apart(self) -> npt.NDArray[np.bool_]:
+        """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
+        if self.frame.radius == 0.0 or not _FEWEST_APART <= len(self.points.xyz) <= self.filter.tile_points:
+            return np.zeros(len(self.rows), dtype=bool)
+        apart = isolated(self.frame.enter(self.points.xyz), workers=self.filter.threads)
+        return apart[self.points.inverse]
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass."""
@@ -258,8 +271,10 @@ class Run:
         untouched = len(out) - len(self.rows)
         warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
         if self.far_out:
-            farther = f"more than {_FAR_OUT:.0e} times as far out as half of the others"
+            farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
             warnings.append(f"{self.far_out} points are {farther} and were passed through")
+        if self.apart:
+            warnings.append(f"{self.apart} points lie apart from all others and were passed through")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
         elif len(self.points.xyz) < _FEW_POINTS:
@@ -364,21 +379,6 @@ class _Distinct:
             return distinct.astype(np.int64)
         groups = [self._order[self._starts[d] : self._starts[d + 1]] for d in distinct]
         return np.concatenate(groups) if groups else distinct.astype(np.int64)
-
-
-def _far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
-    none = np.zeros(len(xyz), dtype=bool)
-    some = np.unique(xyz[:: max(1, len(xyz) // _SOME)], axis=0)  # where many rows say "no data", all say the same
-    if len(some) == 0:
-        return none
-    middle = np.median(some / 2, axis=0)  # halves: a difference may overflow
-    reach = np.median(np.abs(some / 2 - middle).max(axis=1))
-    ends = np.stack([xyz.min(axis=0), xyz.max(axis=0)]) / 2
-    if reach == 0 or np.abs(ends - middle).max() / _FAR_OUT <= reach:
-        return none
-    far: npt.NDArray[np.bool_] = np.abs(xyz / 2 - middle).max(axis=1) / _FAR_OUT > reach
-    return far
 
 
 def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:

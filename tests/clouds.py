@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["distance_to_torus", "noisy", "sphere", "torus"]
+__all__ = ["distance_to_torus", "far_group", "noisy", "sphere", "torus"]
 
 _RING, _TUBE = 0.7, 0.3
 
@@ -30,6 +30,11 @@ def sphere(count: int, seed: int = 0) -> npt.NDArray[np.float64]:
     """Sample (count, 3) float64 points of the unit sphere."""
     xyz = np.random.default_rng(seed).standard_normal((count, 3))
     return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+
+
+def far_group(away: float, count: int = 12) -> npt.NDArray[np.float64]:
+    """Put (count, 3) points together so far away that beside them a cloud is a scene: one alone would be passed over."""
+    return np.array([away, 0, 0]) + 0.01 * np.random.default_rng(7).standard_normal((count, 3))
 
 
 def noisy(xyz: npt.NDArray[np.float64], noise_std: float, seed: int = 1) -> npt.NDArray[np.float64]:

@@ -51,6 +51,12 @@ def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> 
     assert passes(Calibration(crowded=1.0), dense) == 2
 
 
+def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
+    assert passes(Calibration(), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 1
+    assert passes(Calibration(stuck=1.0, starts=(0.45,)), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 2
+    assert passes(Calibration(), trace(0.0, 0.90, 0.80, 0.40, 0.20)) > 1  # so much noise that a pass hardly shows
+
+
 def test_the_limits_are_those_under_which_recorded_clouds_end_best() -> None:
     smooth = [  # four passes are best, one more does harm
         Trace("smooth", 0.02, (0.87, 0.24, 0.15, 0.13, 0.12, 0.11), (9.0, 4.0, 3.0, 2.5, 2.0, 2.2)),

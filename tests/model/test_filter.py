@@ -16,7 +16,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import distance_to_torus, noisy, sphere, torus
+from tests.clouds import distance_to_torus, far_group, noisy, sphere, torus
 
 ONE_PASS = DenoiseOptions(iterations=1)
 
@@ -94,7 +94,7 @@ def test_rows_that_mean_no_data_pass_through_and_harm_no_other(tiny: Filter, far
 
 def test_rows_may_be_far_out_or_all_be_huge(tiny: Filter) -> None:
     cloud = noisy(torus(1200), 0.01)
-    assert tiny.denoise(np.vstack([cloud, [[1e8, 0, 0]]]), ONE_PASS).untouched == 0
+    assert tiny.denoise(np.vstack([cloud, far_group(1e8)]), ONE_PASS).untouched == 0
     huge = tiny.denoise(cloud * 1e307, ONE_PASS)
     assert huge.untouched == 0
     assert np.isfinite(huge.xyz).all()
@@ -185,7 +185,7 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
     assert len(seen) == 3
 
 
-@pytest.mark.parametrize(("far", "zooms"), [(0.0, 1), (100.0, 0)])  # an object; one far beside a stray point: a scene
+@pytest.mark.parametrize(("far", "zooms"), [(0.0, 1), (100.0, 0)])  # an object; beside far points: a scene
 def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
     shipped: Filter, monkeypatch: pytest.MonkeyPatch, far: float, zooms: int
 ) -> None:
@@ -196,7 +196,7 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
         return 1.0
 
     monkeypatch.setattr("straightpcf.model.noise.zoom_of", zoom)
-    cloud = np.concatenate([noisy(torus(3000), 0.02), [[far, 0, 0]]])
+    cloud = np.concatenate([noisy(torus(3000), 0.02), far_group(far)])
     shipped.denoise(cloud, DenoiseOptions(iterations=2))
     assert len(seen) == zooms
     assert all(0.015 < noise < 0.03 for noise in seen)

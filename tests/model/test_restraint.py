@@ -11,7 +11,7 @@ from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import across, reaches, restrained
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import distance_to_torus, noisy, torus
+from tests.clouds import distance_to_torus, far_group, noisy, torus
 
 
 def one_patch(count: int) -> Patches:
@@ -72,9 +72,8 @@ def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
     rng = np.random.default_rng(0)
     ground = rng.uniform([-5, -5, 0], [5, 5, 0], (6000, 3))
     wire = np.stack([np.linspace(-4, 4, 60), np.zeros(60), np.full(60, 1.0)], axis=1)
-    far = [[300.0, 0, 0]]  # beside which patches are those of a scene
     result = load_filter(device="cpu").denoise(
-        np.concatenate([noisy(ground, 0.05), noisy(wire, 0.05), far]), DenoiseOptions(iterations=1)
+        np.concatenate([noisy(ground, 0.05), noisy(wire, 0.05), far_group(300.0)]), DenoiseOptions(iterations=1)
     )
     height = result.xyz[:6000, 2]
     assert np.sqrt(np.mean(height**2)) < 0.4 * 0.05
@@ -84,20 +83,20 @@ def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
 
 
 def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
-    cloud = np.concatenate([noisy(torus(9000), 0.07), [[300.0, 0, 0]]])
+    cloud = np.concatenate([noisy(torus(9000), 0.07), far_group(300.0)])
     run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=2))
     for patch in run.patches():
         cloud[patch.indices] = patch.xyz
     assert run.readings[0].scene
     assert run.readings[0].parts > 1
     assert run.result(0.0).noise_before == pytest.approx(0.07, rel=0.4)
-    assert np.sqrt(np.mean(distance_to_torus(cloud[:-1]) ** 2)) < 0.4 * 0.07
+    assert np.sqrt(np.mean(distance_to_torus(cloud[:9000]) ** 2)) < 0.4 * 0.07
 
 
 def test_what_was_an_object_before_the_first_pass_stays_one() -> None:
     cloud = noisy(torus(5000), 0.01)
     run = Run(load_filter(device="cpu"), cloud, DenoiseOptions())
-    wide = np.concatenate([cloud, [[300.0, 0, 0]]])
+    wide = np.concatenate([cloud, far_group(300.0)])
     wide /= 300.0
     tiling = Tiling(wide, split(wide, 10_000), coverage=1.0, seed=0)
     assert run.reader.read(wide, tiling, None).scene

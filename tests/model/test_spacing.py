@@ -33,6 +33,16 @@ def test_chance_is_told_from_evenness_while_noise_is_below_the_spacing(count: in
     assert not scattered(even_sphere(count), share * spacing)
 
 
+def test_lines_are_not_even() -> None:
+    turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 300, endpoint=False), np.linspace(-0.8, 0.8, 13))
+    lines = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), height], axis=-1).reshape(-1, 3)
+    assert scattered(lines, 0.0)
+    assert scattered(lines, 0.01)
+    turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 90, endpoint=False), np.linspace(-0.8, 0.8, 46))
+    squares = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), height], axis=-1).reshape(-1, 3)
+    assert not scattered(squares, 0.01)
+
+
 def test_where_nothing_tells_points_are_taken_for_even() -> None:
     assert not scattered(sphere(3000), 0.06)  # the spacing is 0.065
     assert not scattered(sphere(99), 0.0)  # a third of which have the nearest 32 in common

@@ -1,0 +1,87 @@
+"""Which points of a cloud belong to nothing: signs for "no data", and what a scanner saw in the air."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from straightpcf.model.normalize import CloudFrame, is_scene
+from straightpcf.model.patches import PATCH_SIZE
+
+__all__ = ["FAR_OUT", "far_out", "isolated"]
+
+# A row so many times as far out as half of the rows are is a file's sign for "no data". With it, float64 would hold all
+# others in one place.
+FAR_OUT, _SOME = 1e12, 10_000
+
+_AROUND = 8  # neighbours: what lies in a group of more belongs to something
+# How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
+# with 3 % of Gaussian noise none is beyond the first pair; the second is for what is near the surface, once the far is
+# gone. Laplace noise has a few beyond the first: so few are noise, but for those that make the bounding sphere larger.
+_DENSE = 0.9
+_FAR, _FARTHER_THAN_NEIGHBOURS = 4.5, 5.0
+_NEAR, _NEARER_THAN_NEIGHBOURS, _ROUNDS = 2.0, 2.5, 3
+_NOTICED, _ALONE = 0.001, 20.0  # of the points; where fewer are far, they have to be so far
+_MOST = 0.1  # of the points; where more seem to belong to nothing, the cloud is of another kind
+_PROBES = 48
+_BLOCK = 2**16  # points whose neighbours are held at once
+
+
+def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
+    none = np.zeros(len(xyz), dtype=bool)
+    some = np.unique(xyz[:: max(1, len(xyz) // _SOME)], axis=0)  # where many rows say "no data", all say the same
+    if len(some) == 0:
+        return none
+    middle = np.median(some / 2, axis=0)  # halves: a difference may overflow
+    reach = np.median(np.abs(some / 2 - middle).max(axis=1))
+    ends = np.stack([xyz.min(axis=0), xyz.max(axis=0)]) / 2
+    if reach == 0 or np.abs(ends - middle).max() / FAR_OUT <= reach:
+        return none
+    far: npt.NDArray[np.bool_] = np.abs(xyz / 2 - middle).max(axis=1) / FAR_OUT > reach
+    return far
+
+
+def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[np.bool_]:
+    """Say of each point of an object (N, 3) whether it lies apart from all others: (N,).
+
+    None does in a scene, whose far parts are sparse, and where more than _MOST would. Where some do, everyone's patches
+    have a few, which read as noise that the whole cloud has.
+    """
+    apart = _beyond(xyz, (_FAR, _FARTHER_THAN_NEIGHBOURS), workers)
+    if not apart.any():
+        return apart
+    few = apart.mean() < _NOTICED
+    if few:
+        apart = _beyond(xyz, (_ALONE, np.inf), workers)
+    if _is_scene(xyz[~apart]) or apart.mean() > _MOST:
+        return np.zeros_like(apart)
+    for _ in range(0 if few else _ROUNDS):
+        rows = np.flatnonzero(~apart)
+        found = _beyond(xyz[rows], (_NEAR, _NEARER_THAN_NEIGHBOURS), workers)
+        if not found.any() or apart.sum() + found.sum() > _MOST * len(xyz):
+            break
+        apart[rows[found]] = True
+    return apart
+
+
+def _beyond(xyz: npt.NDArray[np.float64], limits: tuple[float, float], workers: int) -> npt.NDArray[np.bool_]:
+    count = min(_AROUND, len(xyz) - 1)
+    tree, reach = cKDTree(xyz), np.empty(len(xyz))
+    around = np.empty((len(xyz), count), dtype=np.int32)
+    for start in range(0, len(xyz), _BLOCK):
+        some = slice(start, start + _BLOCK)
+        distance, index = tree.query(xyz[some], k=np.arange(2, count + 2), workers=workers)
+        reach[some], around[some] = distance[:, -1], index
+    out = reach > limits[0] * np.quantile(reach, _DENSE)
+    for start in range(0, len(xyz), _BLOCK):
+        some = slice(start, start + _BLOCK)
+        out[some] |= reach[some] > limits[1] * np.median(reach[around[some]], axis=1)
+    return out
+
+
+def _is_scene(xyz: npt.NDArray[np.float64]) -> bool:
+    size = min(PATCH_SIZE, len(xyz))
+    radii = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // _PROBES)], k=[size])[0]
+    return is_scene(float(np.median(radii)) / max(CloudFrame.of(xyz).radius, 1e-300))

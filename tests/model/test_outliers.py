@@ -1,0 +1,60 @@
+"""A few points in the air are passed through, and are not taken for noise that the whole cloud has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import Filter, load_filter
+from straightpcf.model.outliers import isolated
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import distance_to_torus, noisy, torus
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Filter:
+    return load_filter(device="cpu", threads=2)
+
+
+def in_the_air(count: int, reach: float) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-reach, reach, (count, 3))
+
+
+@pytest.mark.parametrize("reach", [1.3, 4.0, 1000.0])
+def test_a_hundredth_of_points_in_the_air_changes_little_for_the_others(shipped: Filter, reach: float) -> None:
+    clean, options = torus(5000), DenoiseOptions()
+    rough = noisy(clean, 0.005)
+    alone = shipped.denoise(rough, options)
+    together = shipped.denoise(np.vstack([rough, in_the_air(50, reach)]), options)
+    rms = [np.sqrt(np.square(distance_to_torus(r.xyz[:5000])).mean()) for r in (alone, together)]
+    assert rms[1] < 1.3 * rms[0]
+    assert together.iterations <= alone.iterations
+    assert 35 <= together.untouched <= 52
+    assert "apart from all others" in together.warnings[0]
+
+
+@pytest.mark.parametrize("noise_std", [0.0, 0.01, 0.03])
+def test_no_point_of_a_noisy_cloud_is_taken_for_alone(noise_std: float) -> None:
+    assert not isolated(noisy(torus(5000), noise_std)).any()
+    heavy = np.random.default_rng(1).laplace(scale=noise_std or 1e-6, size=(5000, 3))
+    assert not isolated(torus(5000) + heavy).any()
+
+
+def test_one_point_far_away_does_not_make_an_object_a_scene() -> None:
+    with_it = np.vstack([torus(5000), [[40.0, 0, 0]]])
+    assert np.flatnonzero(isolated(with_it)).tolist() == [5000]
+
+
+def test_groups_and_halves_belong_to_something() -> None:
+    two = np.vstack([torus(3000), 0.1 * torus(300) + [3.0, 0, 0]])
+    assert not isolated(two).any()
+    sparse = np.vstack([torus(4000)[torus(4000)[:, 0] > 0], torus(400)[torus(400)[:, 0] < 0]])
+    assert isolated(sparse).mean() < 0.01
+
+
+def test_a_scene_keeps_its_sparse_parts() -> None:
+    rng = np.random.default_rng(0)
+    far = rng.exponential(4.0, 40_000) + 1  # a ground whose points get fewer with the distance
+    turn = rng.uniform(0, 2 * np.pi, 40_000)
+    ground = np.stack([far * np.cos(turn), far * np.sin(turn), np.zeros(40_000)], axis=1)
+    assert not isolated(ground / np.abs(ground).max()).any()
