@@ -33,7 +33,7 @@ def sphere(count: int, seed: int = 0) -> npt.NDArray[np.float64]:
 
 
 def far_group(away: float, count: int = 12) -> npt.NDArray[np.float64]:
-    """Put (count, 3) points together so far away that beside them a cloud is a scene: one alone would be passed over."""
+    """Put (count, 3) points together so far away that beside them a cloud is a scene; one alone is passed over."""
     return np.array([away, 0, 0]) + 0.01 * np.random.default_rng(7).standard_normal((count, 3))
 
 
