@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["distance_to_torus", "far_group", "noisy", "sphere", "torus"]
+__all__ = ["distance_to_torus", "even_sphere", "far_group", "noisy", "sphere", "torus"]
 
 _RING, _TUBE = 0.7, 0.3
 
@@ -35,6 +35,14 @@ def sphere(count: int, seed: int = 0) -> npt.NDArray[np.float64]:
 def far_group(away: float, count: int = 12) -> npt.NDArray[np.float64]:
     """Put (count, 3) points together so far away that beside them a cloud is a scene; one alone is passed over."""
     return np.array([away, 0, 0]) + 0.01 * np.random.default_rng(7).standard_normal((count, 3))
+
+
+def even_sphere(count: int) -> npt.NDArray[np.float64]:
+    """Spread (count, 3) float64 points over the unit sphere along a golden spiral."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 def noisy(xyz: npt.NDArray[np.float64], noise_std: float, seed: int = 1) -> npt.NDArray[np.float64]:

@@ -9,15 +9,7 @@ from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import is_scattered
-from tests.clouds import noisy, sphere, torus
-
-
-def even_sphere(count: int) -> np.ndarray:
-    """Spread (count, 3) points over the unit sphere along a golden spiral."""
-    z = 1 - 2 * (np.arange(count) + 0.5) / count
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+from tests.clouds import even_sphere, noisy, sphere, torus
 
 
 def scattered(xyz: np.ndarray, noise_std: float) -> bool:

@@ -11,7 +11,7 @@ from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.spread import spread
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import sphere
+from tests.clouds import even_sphere, sphere
 
 
 def unevenness(xyz: npt.NDArray[np.float64]) -> float:
@@ -71,9 +71,9 @@ def test_the_filter_spreads_between_passes_only(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr("straightpcf.model.on_host.spread", counted)
     model = Filter(StraightPCF(), threads=1)
-    for passes, between in [(1, 0), (3, 2)]:
+    for cloud, passes, between in [(even_sphere(500), 1, 0), (even_sphere(500), 3, 2), (sphere(500), 3, 0)]:
         calls.clear()
-        model.denoise(sphere(500), DenoiseOptions(iterations=passes))
+        model.denoise(cloud, DenoiseOptions(iterations=passes))
         assert len(calls) == between
         assert len(set(calls)) <= 1
     calls.clear()
