@@ -216,23 +216,28 @@ class Run:
         self.filter, self.options, self.xyz = owner, options, xyz
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
-        self.rows = self.rows[~far_out(xyz[self.rows])]
+        self.rows = self.rows[~far_out(self._of_rows())]
         self.far_out = len(xyz) - self.not_finite - len(self.rows)
         if len(self.rows) < MIN_POINTS:
             others = f"{self.not_finite} not finite, {self.far_out} far out"
             raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
-        self._take(xyz if len(self.rows) == len(xyz) else xyz[self.rows])
+        self._take()
         apart = self._apart()
         self.apart = int(apart.sum())
         if self.apart:
             self.rows = self.rows[~apart]
-            self._take(xyz[self.rows])
+            self._take()
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.readings: list[Reading] = []  # before each pass, and after the last
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
-    def _take(self, cloud: npt.NDArray[np.float64]) -> None:
+    def _of_rows(self) -> npt.NDArray[np.float64]:
+        """Return the rows that are filtered, without a copy where they are all."""
+        return self.xyz if len(self.rows) == len(self.xyz) else self.xyz[self.rows]
+
+    def _take(self) -> None:
+        cloud = self._of_rows()
         self.frame = CloudFrame.of(cloud)
         self.points = _Distinct(cloud)
 

@@ -49,24 +49,27 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
     None does in a scene, whose far parts are sparse, and where more than _MOST would. Where some do, everyone's patches
     have a few, which read as noise that the whole cloud has.
     """
-    apart = _beyond(xyz, (_FAR, _FARTHER_THAN_NEIGHBOURS), workers)
-    if not apart.any():
-        return apart
+    beside_most, beside_neighbours = _distances(xyz, workers)
+    apart = (beside_most > _FAR) | (beside_neighbours > _FARTHER_THAN_NEIGHBOURS)
     few = apart.mean() < _NOTICED
     if few:
-        apart = _beyond(xyz, (_ALONE, np.inf), workers)
-    if _is_scene(xyz[~apart]) or apart.mean() > _MOST:
+        apart = beside_most > _ALONE
+    if not apart.any():
+        return apart
+    if apart.mean() > _MOST or _is_scene(xyz[~apart]):
         return np.zeros_like(apart)
     for _ in range(0 if few else _ROUNDS):
         rows = np.flatnonzero(~apart)
-        found = _beyond(xyz[rows], (_NEAR, _NEARER_THAN_NEIGHBOURS), workers)
+        beside_most, beside_neighbours = _distances(xyz[rows], workers)
+        found = (beside_most > _NEAR) | (beside_neighbours > _NEARER_THAN_NEIGHBOURS)
         if not found.any() or apart.sum() + found.sum() > _MOST * len(xyz):
             break
         apart[rows[found]] = True
     return apart
 
 
-def _beyond(xyz: npt.NDArray[np.float64], limits: tuple[float, float], workers: int) -> npt.NDArray[np.bool_]:
+def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return how far each point's 8th neighbour is, beside most points and beside its own neighbours: (N,) each."""
     count = min(_AROUND, len(xyz) - 1)
     tree, reach = cKDTree(xyz), np.empty(len(xyz))
     around = np.empty((len(xyz), count), dtype=np.int32)
@@ -74,11 +77,11 @@ def _beyond(xyz: npt.NDArray[np.float64], limits: tuple[float, float], workers: 
         some = slice(start, start + _BLOCK)
         distance, index = tree.query(xyz[some], k=np.arange(2, count + 2), workers=workers)
         reach[some], around[some] = distance[:, -1], index
-    out = reach > limits[0] * np.quantile(reach, _DENSE)
+    of_neighbours = np.empty(len(xyz))
     for start in range(0, len(xyz), _BLOCK):
         some = slice(start, start + _BLOCK)
-        out[some] |= reach[some] > limits[1] * np.median(reach[around[some]], axis=1)
-    return out
+        of_neighbours[some] = np.median(reach[around[some]], axis=1)
+    return reach / max(np.quantile(reach, _DENSE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
 
 
 def _is_scene(xyz: npt.NDArray[np.float64]) -> bool:

@@ -21,24 +21,26 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     cpu.instruction_set.cache_clear()
 
 
-@pytest.mark.parametrize("machine", ["aarch64", "arm64", "riscv64"])
-def test_a_machine_without_x86_compiles_and_takes_the_generic_kernels(
-    machine: str, asked: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Though under emulation /proc/cpuinfo may list what the host has."""
-    monkeypatch.setattr(platform, "machine", lambda: machine)
-    monkeypatch.setattr(Path, "read_text", lambda _: "flags : avx2 avx512bw avx512_bf16")
-    assert cpu.instruction_set() == "generic"
-    cpu.build_all(tmp_path)
-    assert asked == ["generic"]
+_EVERY = ["avx512_bf16", "avx512bw", "avx2", "generic"]
 
 
-@pytest.mark.parametrize("machine", ["x86_64", "AMD64"])
-def test_an_image_for_x86_carries_every_instruction_set(
-    machine: str, asked: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("machine", "flags", "taken", "in_an_image"),
+    [
+        # Under emulation /proc/cpuinfo may list what the host has.
+        ("aarch64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
+        ("arm64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
+        ("riscv64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
+        ("x86_64", "fma avx2", "avx2", _EVERY),
+        ("AMD64", "fma avx2", "avx2", _EVERY),
+    ],
+)
+def test_a_machine_compiles_and_takes_the_kernels_of_its_architecture(
+    machine: str, flags: str, taken: str, in_an_image: list[str],
+    asked: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:  # fmt: skip
     monkeypatch.setattr(platform, "machine", lambda: machine)
-    monkeypatch.setattr(Path, "read_text", lambda _: "flags : fma avx2")
-    assert cpu.instruction_set() == "avx2"
+    monkeypatch.setattr(Path, "read_text", lambda _: f"flags : {flags}")
+    assert cpu.instruction_set() == taken
     cpu.build_all(tmp_path)
-    assert asked == ["avx512_bf16", "avx512bw", "avx2", "generic"]
+    assert asked == in_an_image
