@@ -24,7 +24,7 @@ from straightpcf.model.on_host import OnHost
 from straightpcf.model.outliers import FAR_OUT, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
-from straightpcf.model.restraint import across, reaches, restrained
+from straightpcf.model.restraint import made_of, reaches
 from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
@@ -135,8 +135,8 @@ class Filter:
         """Put a network between the stages.
 
         even: between passes, points are spread along the surface (`spread`). zoom: passes show an object in the size of
-        its noise, and in parts where that fills the patches (`NoiseReader`); a scene's points go no farther than it
-        and, like others that lie by chance, not along surfaces (`restraint`).
+        its noise, and in parts where that fills the patches (`NoiseReader`), and less than what the network asks for is
+        made of steps that are more than the noise (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
         Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
         """
@@ -229,6 +229,7 @@ class Run:
             self._take()
         self.iterations = 0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
+        self.held = np.zeros(len(self.moved), dtype=bool)
         self.readings: list[Reading] = []  # before each pass, and after the last
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
@@ -280,6 +281,8 @@ class Run:
             warnings.append(f"{self.far_out} points are {farther} and were passed through")
         if self.apart:
             warnings.append(f"{self.apart} points lie apart from all others and were passed through")
+        if held := np.count_nonzero(self.held[self.points.inverse]):
+            warnings.append(f"{held} points are on walls closer together than points are, and were held back")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
         elif len(self.points.xyz) < _FEW_POINTS:
@@ -309,7 +312,7 @@ class Run:
         Not before the first, nor where chance laid them, or a scanner: scan lines are no clumps. d is read of the
         points so spread, also where no pass comes after.
         """
-        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].scattered:
+        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].lie.scattered:
             return 0.0
         return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
 
@@ -325,10 +328,10 @@ class Run:
             for patch, displacement in self.filter.processor.displacements(here, cut, scales, probed):
                 owned = cut.owned_points(patch)
                 step = displacement / scales[patch]
-                if believed is not None:
-                    step = restrained(self.moved[owned], step, believed[patch])
-                if shown.scattered and self.filter.zoom:
-                    step = across(step, here[cut.index[patch]])
+                if self.filter.zoom:
+                    limit = None if believed is None else believed[patch]
+                    step, held = made_of(step, self.moved[owned], here[cut.index[patch]], lie=shown.lie, believed=limit)
+                    self.held[owned] |= held
                 self.moved[owned] += step
                 settled += len(owned)
                 copies = self.points.copies(owned)

@@ -20,7 +20,7 @@ from straightpcf.model.normalize import (
 )
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
-from straightpcf.model.spacing import is_scattered
+from straightpcf.model.spacing import Lie
 from straightpcf.model.tiles import Tiling, parted
 
 __all__ = ["NoiseReader", "Reading"]
@@ -38,7 +38,7 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; scattered: whether points lie on their surface by chance, as a scene's do; zoom: the factor by
+    object seen whole; lie: how its points lie, before the first pass; zoom: the factor by
     which the pass shows an object larger; parts: in how many it filters it; noise_in_radii: an object's noise std in
     radii of its patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what
     the DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's
@@ -48,7 +48,7 @@ class Reading:
     distance: float
     noise_std: float
     scene: bool
-    scattered: bool
+    lie: Lie
     zoom: float = 1.0
     parts: int = 1
     noise_in_radii: float = 0.0
@@ -80,10 +80,10 @@ class NoiseReader:
         if scene:
             noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
             probed = known if parts == 1 else {}
-            return Reading(distance, noise, scene, scattered=True, parts=parts, probed=probed, usual=usual)
+            return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
         zoom, parts, in_radii = 1.0, 1, 0.0
-        scattered = is_scattered(here, probes, noise) if first is None else first.scattered
+        lie = Lie.of(here, probes, noise) if first is None else first.lie
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:
@@ -93,11 +93,11 @@ class NoiseReader:
             elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
                 zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
         if parts > 1:  # of other patches
-            return Reading(distance, noise, scene, scattered, zoom, parts, in_radii)
+            return Reading(distance, noise, scene, lie, zoom, parts, in_radii)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, scattered, zoom, 1, in_radii, known)
+        return Reading(distance, noise, scene, lie, zoom, 1, in_radii, known)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""

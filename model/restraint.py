@@ -1,17 +1,21 @@
-"""How far the points of a scene may go, and where to: no farther than its noise reaches.
+"""How much of a step the network asks for is made: what is more than the noise is not.
 
-And not along a surface, nor may those of an object that lie on it by chance.
+The points of a scene go no farther than its noise reaches, and not along a surface, nor do those of an object that lie
+on it by chance. Those of a quiet object go less far (`quiet`), and where walls would be joined none goes (`walls`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from straightpcf.model.neighbourhoods import neighbourhoods
 from straightpcf.model.patches import Patches
+from straightpcf.model.quiet import tempered
+from straightpcf.model.spacing import Lie
+from straightpcf.model.walls import share_between_walls
 
-__all__ = ["across", "reaches", "restrained"]
+__all__ = ["across", "made_of", "reaches", "restrained"]
 
 # In noise stds: moves up to the first are made whole, from the last on none is (docs/training.md, "How far ...").
 _WHOLE, _NONE = 3.0, 4.0
@@ -19,11 +23,40 @@ _SHEET = 1.3  # a patch is one sheet where its points lie so many of its noise s
 _MOST = 3.0  # of the usual noise, what is believed of any sheet
 _DOUBTFUL = 1.2  # of the usual noise; of what is no sheet and reads more, less is believed the more it reads
 
+_HELD = 0.5  # of a step; where less is left between walls, that is said
+
 # Of a point's nearest neighbours, the std across their plane beside the lesser one along it: up to the first nothing
 # moves along the plane, from the last on all that was asked does. As much as is asked moves along a line, of which the
 # stds along the plane are as 1 : 10 or less; from 1 : 5 on it is none.
 _AROUND = 24
 _FLAT, _ROUND, _LINE = 0.15, 0.3, 0.1
+
+
+def made_of(
+    step: npt.NDArray[np.float64],
+    moved: npt.NDArray[np.float64],
+    around: npt.NDArray[np.float64],
+    *,
+    lie: Lie,
+    believed: float | None,
+) -> tuple[npt.NDArray[np.float64], bool]:
+    """Return what is made of a step (n, 3), and whether it would have joined walls.
+
+    moved: (n, 3), by the passes before; around: (P, 3), the patch, of which the first n points make the step; believed:
+    the noise std of a scene's patch (`reaches`).
+    """
+    if len(step) == 0:
+        return step, False
+    if believed is not None:
+        step = restrained(moved, step, believed)
+    share = share_between_walls(step, around) if lie.walls else 1.0
+    if share < 1:
+        step = share * step
+    if lie.scattered:
+        step = across(step, around)
+    if lie.quiet > 0:
+        step = tempered(step, around, lie.quiet)
+    return step, share < _HELD
 
 
 def reaches(
@@ -60,14 +93,10 @@ def across(step: npt.NDArray[np.float64], around: npt.NDArray[np.float64]) -> np
     (`spread`); others lie as beams or chance have it (`is_scattered`): to draw them together widens gaps and tears scan
     lines, and to spread them takes them away from where they were.
     """
-    count = min(_AROUND, len(around))
-    _, nearest = cKDTree(around).query(around[: len(step)], k=np.arange(1, count + 1))
-    local = around[nearest] - around[nearest].mean(axis=1, keepdims=True)
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
-    least, less, most = np.sqrt(np.maximum(variances, 1e-300)).T
+    near = neighbourhoods(around[: len(step)], around, _AROUND)
+    least, less, most = np.sqrt(np.maximum(near.variances, 1e-300)).T
     plane = np.clip((_ROUND - least / less) / (_ROUND - _FLAT), 0, 1) * np.clip(less / most / _LINE - 1, 0, 1)
-    normals = axes[:, :, 0]
-    along = step - (step * normals).sum(axis=1, keepdims=True) * normals
+    along = step - (step * near.normals).sum(axis=1, keepdims=True) * near.normals
     out: npt.NDArray[np.float64] = step - along * plane[:, None]
     return out
 

@@ -1,14 +1,19 @@
-"""How a cloud's points lie on their surface: evenly, or as chance or a scanner has it."""
+"""How a cloud's points lie on their surface: evenly, or as chance or a scanner has it, and how near it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from straightpcf.model.neighbourhoods import inner_points
 from straightpcf.model.patches import Patches
+from straightpcf.model.quiet import quietness
+from straightpcf.model.walls import has_walls
 
-__all__ = ["is_scattered"]
+__all__ = ["Lie", "is_scattered"]
 
 # The ratio of the areas that a point's nearest 8 and nearest 32 others take varies, as a logarithm, with a std of
 # 0.3 where points fall by chance (a beta distribution's 0.32, less what counting leaves out), and of 0.12 to 0.17 where
@@ -19,7 +24,24 @@ _SCATTERED, _TELLING = 0.25, 0.6
 # cells of 1 : 2.5 and more, and by chance.
 _LINED = 1.3
 _SAMPLES, _LEAST = 2000, 100
-_INNER = 1 / 3  # of a patch's points, those whose neighbours are in the patch, too
+
+
+@dataclass(frozen=True)
+class Lie:
+    """How points lie before the first pass.
+
+    scattered: on their surface by chance, or in lines, as a scene's do; quiet: how little noise an object's have beside
+    the distances between them, 0 to 1; walls: whether they may be on walls closer together than these.
+    """
+
+    scattered: bool = False
+    quiet: float = 0.0
+    walls: bool = False
+
+    @classmethod
+    def of(cls, xyz: npt.NDArray[np.float64], patches: Patches, noise_std: float) -> Lie:
+        """Look at an object's points (N, 3), with noise of some std, in some of its patches."""
+        return cls(is_scattered(xyz, patches, noise_std), quietness(xyz, patches), has_walls(xyz, patches))
 
 
 def is_scattered(xyz: npt.NDArray[np.float64], patches: Patches, noise_std: float) -> bool:
@@ -30,9 +52,9 @@ def is_scattered(xyz: npt.NDArray[np.float64], patches: Patches, noise_std: floa
     size = patches.index.shape[1]
     if size < _LEAST:
         return False
-    inner = size if len(patches.seeds) == 1 else round(_INNER * size)
-    step = max(1, inner * len(patches.seeds) // _SAMPLES)
-    areas = np.concatenate([_areas(xyz[rows], inner, step) for rows in patches.index])
+    inner = [(points, some) for points, some in inner_points(xyz, patches)]
+    step = max(1, sum(len(some) for _, some in inner) // _SAMPLES)
+    areas = np.concatenate([_areas(some[::step], points) for points, some in inner])
     nearest, few, many = np.maximum(areas.T, 1e-300)
     if noise_std >= _TELLING * np.sqrt(np.pi / _MANY * np.median(many)):
         return False
@@ -40,12 +62,10 @@ def is_scattered(xyz: npt.NDArray[np.float64], patches: Patches, noise_std: floa
     return bool(high - low > 2 * _SCATTERED or _MANY * np.median(nearest / many) < _LINED)
 
 
-def _areas(points: npt.NDArray[np.float64], inner: int, step: int) -> npt.NDArray[np.float64]:
-    """Return the squared distances from every step-th of the inner points of a patch (P, 3) to three of the others.
+def _areas(some: npt.NDArray[np.float64], points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the squared distances from some points (n, 3) of a patch (P, 3) to three of its others.
 
-    (n, 3): to the nearest, the 8th and the 32nd; inner: how many points count as inner, those nearest to the middle.
+    (n, 3): to the nearest, the 8th and the 32nd.
     """
-    middle = np.square(points - points.mean(axis=0)).sum(axis=1)
-    some = points[np.argsort(middle)[:inner:step]]
     distances: npt.NDArray[np.float64] = cKDTree(points).query(some, k=[2, _FEW + 1, _MANY + 1])[0]  # with itself
     return np.square(distances)

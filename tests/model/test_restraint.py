@@ -9,6 +9,7 @@ from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import across, reaches, restrained
+from straightpcf.model.spacing import Lie
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, far_group, noisy, torus
@@ -100,4 +101,4 @@ def test_what_was_an_object_before_the_first_pass_stays_one() -> None:
     wide /= 300.0
     tiling = Tiling(wide, split(wide, 10_000), coverage=1.0, seed=0)
     assert run.reader.read(wide, tiling, None).scene
-    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False, scattered=False)).scene
+    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False, lie=Lie())).scene

@@ -1,0 +1,88 @@
+"""Clouds with little noise beside the distance between their points: how far the points of one may go.
+
+Where the distance between points is a good part of a shape's radii of curvature, the network takes shape for noise: it
+moves 1000 clean points of a sphere by 0.5 % of its radius. A surface of second order through a few neighbours tells the
+two apart, as long as noise does not tilt it (docs/training.md, "Little noise").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.model.neighbourhoods import inner_points, neighbourhoods
+from straightpcf.model.patches import Patches
+
+__all__ = ["quietness", "tempered"]
+
+Floats = npt.NDArray[np.float64]
+
+_AROUND, _TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
+_RIDGE = 1e-9  # points in a line have a surface, too; in units of the neighbourhood's radius
+# The noise of a patch is what a quarter of its surfaces leave, or less: the others have edges, bends and thin parts.
+_SHARE = 0.25
+# Noise beside the radius of the 16: up to the first a cloud is quiet, from the second on it is not at all.
+_QUIET, _LOUD = 0.05, 0.08
+# A point so many times the patch's noise from its neighbours' surface, of which the network takes off so much, is one
+# with more noise than the others.
+_OUT, _TAKEN_BACK = 6.0, 0.6
+_LEAST_OF_OTHERS = 0.1  # of a point's residual, what the fit to itself has left
+_SAMPLES = 64  # points of a patch of which a cloud's quietness is taken
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """What surfaces fitted to the neighbours of n points leave.
+
+    stds: (n,), of the neighbours; own: (n,), of the point itself, had the surface been fitted to the others only;
+    radii: (n,), of the neighbourhoods; normals: (n, 3), of length 1.
+    """
+
+    stds: Floats
+    own: Floats
+    radii: Floats
+    normals: Floats
+
+
+def quietness(xyz: Floats, patches: Patches) -> float:
+    """Say how little noise points (N, 3) have beside their distances, 0 to 1; patches: some of them, of which half say.
+
+    1: a surface fitted to neighbours reads the noise well. 0: noise hides it.
+    """
+    ratios = []
+    for points, inner in inner_points(xyz, patches):
+        here = _surfaces(inner[:: max(1, len(inner) // _SAMPLES)], points)
+        ratios.append(np.quantile(here.stds / here.radii, _SHARE))
+    return float(np.clip((_LOUD - np.median(ratios)) / (_LOUD - _QUIET), 0.0, 1.0))
+
+
+def tempered(step: Floats, around: Floats, quiet: float) -> Floats:
+    """Return a step (n, 3), less of it where it is more than the noise; quiet: as of `quietness`.
+
+    around: (P, 3), a patch, of which the first n >= 1 points make the step. Of moves m across the surface, with noise
+    n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent of the noise.
+    """
+    here = _surfaces(around[: len(step)], around)
+    noise = np.quantile(here.stds, _SHARE)
+    rise = (step * here.normals).sum(axis=1)
+    weight = min(1.0, noise**2 / max(float(np.square(rise).mean()), np.finfo(np.float64).tiny))
+    out = (np.abs(here.own) > _OUT * noise) & (-rise * here.own > _TAKEN_BACK * here.own**2)
+    weights = np.where(out, 1.0, 1.0 - quiet * (1.0 - weight))
+    less: Floats = step * weights[:, None]
+    return less
+
+
+def _surfaces(points: Floats, around: Floats) -> _Surfaces:
+    """Fit heights of second order over the plane of their neighbours to points (n, 3) and those of `around` (P, 3)."""
+    near = neighbourhoods(points, around, _AROUND)
+    height, x, y = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    products = terms.mT @ terms + _RIDGE * np.eye(_TERMS)
+    solved = np.linalg.solve(products, np.stack([np.einsum("nkp,nk->np", terms, height), terms[:, 0]], axis=-1))
+    left = height - np.einsum("nkp,np->nk", terms, solved[:, :, 0])
+    leverage = np.einsum("np,np->n", terms[:, 0], solved[:, :, 1])
+    own = left[:, 0] / np.maximum(1 - leverage, _LEAST_OF_OTHERS)
+    stds = np.sqrt(np.square(left).sum(axis=1) / (height.shape[1] - _TERMS))
+    return _Surfaces(stds * near.radii, own * near.radii, near.radii, near.normals)

@@ -1,0 +1,84 @@
+"""Walls closer together than their points are to each other: what the network takes for one surface with noise.
+
+Two walls have few points midway between them, and a noisy surface has most there. Where the network would join them,
+nothing moves (docs/training.md, "Two walls or one").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.model.neighbourhoods import inner_points, neighbourhoods
+from straightpcf.model.patches import Patches
+
+__all__ = ["has_walls", "share_between_walls"]
+
+Floats = npt.NDArray[np.float64]
+
+# Of 24 the plane lies along walls that are up to 1.2 times as far apart as points, of 64 up to twice as far.
+_AROUND = (24, 64)
+# The share of neighbours nearer to their plane than half of their std: 0.31 and more of one surface with any noise,
+# 0.02 to 0.27 of walls. A sharp rim with noise has few, too, in some of a cloud's patches.
+_MIDWAY, _FEW, _MAY_BE_FEW, _SOME = 0.5, 0.28, 0.3, 0.2
+_THICK = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
+# Moves across, in that std, up to which all is made of them, and nothing from twice as many on: as many as the noise
+# asks for, of which the share midway says how much there is.
+_MORE, _PER_MIDWAY = 0.14, 1.3
+_INNER, _SAMPLES = 1 / 3, 128
+
+
+@dataclass(frozen=True)
+class _Heights:
+    """What the neighbours of n points have as heights over their planes.
+
+    midway: the share of them that are; std, thick: of half of the points or less, by itself and beside the
+    neighbourhood's radius; normals: (n, 3), the planes'.
+    """
+
+    midway: float
+    std: float
+    thick: float
+    normals: Floats
+
+    @classmethod
+    def of(cls, points: Floats, around: Floats, count: int) -> _Heights:
+        """Look at points (n, 3) and `count` neighbours of each in `around` (P, 3)."""
+        near = neighbourhoods(points, around, count)
+        height = near.along_axes()[:, :, 0]
+        stds = np.sqrt(np.square(height).mean(axis=1))
+        midway = float(np.mean(np.abs(height) < _MIDWAY * stds[:, None]))
+        return cls(midway, float(np.median(stds)), float(np.median(stds / near.radii)), near.normals)
+
+    def are_walls(self, few: float) -> bool:
+        return self.midway < few and self.thick > _THICK
+
+    def share_left(self, step: Floats) -> float:
+        """Say how much is made of (n, 3), the first of the points' step, if it brings walls together."""
+        if not self.are_walls(_FEW):
+            return 1.0
+        rise = (step * self.normals[: len(step)]).sum(axis=1)
+        most = (_MORE + _PER_MIDWAY * self.midway) * self.std
+        return float(np.clip(2.0 - np.sqrt(np.square(rise).mean()) / most, 0.0, 1.0))
+
+
+def has_walls(xyz: Floats, patches: Patches) -> bool:
+    """Say whether points (N, 3) may have walls close together; patches: some of them."""
+    found = []
+    for points, inner in inner_points(xyz, patches):
+        some = inner[:: max(1, len(inner) // _SAMPLES)]
+        found.append([_Heights.of(some, points, count).are_walls(_MAY_BE_FEW) for count in _AROUND])
+    return bool(np.mean(found, axis=0).max() > _SOME)
+
+
+def share_between_walls(step: Floats, around: Floats) -> float:
+    """Return the share of a step (n, 3) that leaves walls apart: 0 where it joins them, 1 where there are none.
+
+    around: (P, 3), a patch, of which the first n >= 1 points make the step.
+    """
+    looked_at = np.arange(0, max(len(step), round(_INNER * len(around))))
+    looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
+    some, their_step = around[looked_at], step[looked_at[looked_at < len(step)]]
+    return min(_Heights.of(some, around, count).share_left(their_step) for count in _AROUND)

@@ -1,0 +1,64 @@
+"""Points with little noise beside their distances go no farther than it, and those with more than others all the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.model.metrics import chamfer_distance
+from straightpcf.model.patches import cut_patches
+from straightpcf.model.quiet import quietness, tempered
+from tests.clouds import even_sphere, noisy, sphere, torus
+
+
+def quiet(xyz: np.ndarray) -> float:
+    return quietness(xyz, cut_patches(xyz, coverage=3.0, seed=0))
+
+
+@pytest.mark.parametrize("cloud", [sphere, even_sphere])
+@pytest.mark.parametrize("count", [1000, 6000])
+def test_noise_is_little_or_much_beside_the_distance_of_points(cloud, count: int) -> None:
+    spacing = np.sqrt(4 * np.pi / count)
+    assert quiet(cloud(count)) == 1.0
+    assert quiet(noisy(cloud(count), 0.08 * spacing)) == 1.0
+    assert quiet(noisy(cloud(count), 0.4 * spacing)) == 0.0
+
+
+def test_as_few_points_as_are_filtered_and_points_in_a_line_are_no_error() -> None:
+    line = np.linspace(0, 1, 400)[:, None] * [1.0, 2.0, 3.0]
+    for xyz in (sphere(33), line):
+        step = np.full((20, 3), 0.1)
+        assert 0 <= quiet(xyz) <= 1
+        assert np.isfinite(tempered(step, xyz, 1.0)).all()
+
+
+def test_a_step_across_is_made_smaller_by_wieners_weight() -> None:
+    rng = np.random.default_rng(0)
+    noise, around = 0.001, np.column_stack([rng.uniform(-1, 1, (1000, 2)), 0.001 * rng.standard_normal(1000)])
+    around = around[np.argsort((around**2).sum(axis=1))]
+    asked = np.column_stack([np.zeros((300, 2)), 4 * noise * rng.standard_normal(300)])
+    made = tempered(asked, around, 1.0)
+    share = np.linalg.norm(made, axis=1) / np.linalg.norm(asked, axis=1)
+    assert np.median(share) == pytest.approx(1 / 16, rel=0.5)
+    np.testing.assert_array_equal(tempered(asked, around, 0.0), asked)
+    small = np.column_stack([np.zeros((300, 2)), -0.5 * around[:300, 2]])
+    np.testing.assert_array_equal(tempered(small, around, 1.0), small)
+
+
+def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
+    rng = np.random.default_rng(0)
+    around = np.column_stack([rng.uniform(-1, 1, (1000, 2)), 0.0005 * rng.standard_normal(1000)])
+    around = around[np.argsort((around**2).sum(axis=1))]
+    around[:300:30, 2] += 0.02
+    step = np.column_stack([np.zeros((300, 2)), 0.002 * rng.standard_normal(300)])
+    step[::30, 2] = -0.02
+    share = np.linalg.norm(tempered(step, around, 1.0), axis=1) / np.linalg.norm(step, axis=1)
+    assert (share[::30] == 1.0).all()
+    assert np.median(share) < 0.2
+
+
+@pytest.mark.parametrize(("clean", "moved", "at_most"), [(sphere(1000), 0.0, 5e-6), (torus(1500), 0.001, 1.0e-5)])
+def test_few_points_with_hardly_any_noise_stay_where_they_are(clean: np.ndarray, moved: float, at_most: float) -> None:
+    result = load_filter(threads=2).denoise(noisy(clean, moved))
+    assert chamfer_distance(result.xyz, clean) < at_most

@@ -1,0 +1,54 @@
+"""Walls closer together than points are to each other are not joined, and one noisy surface is not taken for two."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.model.metrics import chamfer_distance
+from straightpcf.model.patches import cut_patches
+from straightpcf.model.walls import has_walls, share_between_walls
+from tests.clouds import even_sphere, noisy, sphere
+
+
+def plate(count: int, gap: float, seed: int = 0) -> np.ndarray:
+    """Return points (count, 3) that lie by chance on two squares of side 1.2, `gap` apart."""
+    rng = np.random.default_rng(seed)
+    sides = rng.choice([-0.5, 0.5], count)
+    return np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), gap * sides])
+
+
+def walls(xyz: np.ndarray) -> bool:
+    return has_walls(xyz, cut_patches(xyz, coverage=3.0, seed=0))
+
+
+@pytest.mark.parametrize("noise_std", [0.0, 0.008])
+def test_two_walls_are_told_from_one_with_noise(noise_std: float) -> None:
+    assert walls(noisy(plate(2000, 0.04), noise_std))
+    assert not walls(noisy(plate(2000, 0.0), 0.03))
+    for cloud in (sphere(2000), even_sphere(8000)):
+        assert not walls(noisy(cloud, noise_std))
+        assert not walls(noisy(cloud, 0.03))
+        ball = np.random.default_rng(0).standard_normal(cloud.shape)
+        ball *= np.random.default_rng(1).random((len(cloud), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1)[:, None]
+        assert not walls(cloud + 0.04 * ball)
+
+
+def test_a_step_that_brings_walls_together_is_told_from_one_within_them() -> None:
+    around = noisy(plate(1000, 0.06), 0.005)
+    around = around[np.argsort((around**2).sum(axis=1))]
+    together = np.column_stack([np.zeros((300, 2)), -around[:300, 2]])
+    within = np.column_stack([np.zeros((300, 2)), 0.03 * np.sign(around[:300, 2]) - around[:300, 2]])
+    assert share_between_walls(together, around) == 0.0
+    assert share_between_walls(within, around) == 1.0
+    one = noisy(plate(1000, 0.0), 0.03)
+    assert share_between_walls(np.column_stack([np.zeros((300, 2)), -one[:300, 2]]), one) == 1.0
+
+
+def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so() -> None:
+    clean = plate(1500, 0.045)
+    rough = noisy(clean, 0.004)
+    result = load_filter(threads=2).denoise(rough)
+    assert chamfer_distance(result.xyz, clean) <= 1.05 * chamfer_distance(rough, clean)
+    assert any("walls closer together" in warning for warning in result.warnings)
