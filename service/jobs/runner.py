@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import sqlite3
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Any, Literal, Protocol
 
-from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError
+from straightpcf.points.errors import InternalError, JobCanceled, SpoolFull, StraightPCFError
 from straightpcf.points.formats import format_named
 from straightpcf.service.backends.base import Backend, FileJob, FileReport, WorkerDied
 from straightpcf.service.jobs.folders import INPUT, JobFolders
@@ -23,6 +24,7 @@ MAX_DEATHS = 3
 LEASE_SECONDS = 15.0
 HEARTBEAT_SECONDS = 1.0
 POLL_SECONDS = 1.0  # for jobs that another server took in
+END_TRIES = 30  # to write down how a job ended, a POLL_SECONDS apart: what was computed is not computed again
 
 Reason = Literal["canceled", "shutdown", "lost"]
 
@@ -146,8 +148,24 @@ class JobRunner:
             await log.close()
 
     async def _settle(self, running: _Running) -> None:
-        """Wait for a job's end and write it down; not in its task, which may be cancelled before it has begun."""
+        """Wait for a job's end and write it down; not in its task, which may be cancelled before it has begun.
+
+        Where a disk has no room for it, it is tried again under the job's lease, and at last left to the lease's end.
+        """
         await asyncio.wait([running.task])
+        for _ in range(END_TRIES):
+            try:
+                await self._write_end(running)
+            except (OSError, sqlite3.Error, SpoolFull) as fault:
+                if self._stopping:
+                    raise
+                logger.warning("job %s: its end could not be written down yet: %r", running.claim.record.id, fault)
+                await asyncio.sleep(POLL_SECONDS)
+            else:
+                return
+        await self._write_end(running)
+
+    async def _write_end(self, running: _Running) -> None:
         claim = running.claim
         if running.task.cancelled():
             await self._after_cancel(claim, running.reason)
@@ -160,8 +178,11 @@ class JobRunner:
             case StraightPCFError() as error:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
                 await self._fail(claim, error)
-            case fault:
+            case OSError() | sqlite3.Error() as fault:  # this server's trouble
                 raise fault
+            case fault:
+                logger.error("job %s: %r%s", claim.record.id, fault, _trace(claim), exc_info=fault)
+                await self._fail(claim, InternalError("the server failed on this job; its log says how"))
 
     async def _deliver(self, claim: Claim, report: FileReport) -> None:
         record = claim.record

@@ -1,4 +1,4 @@
-"""Points with little noise beside their distances go no farther than it, and those with more than others all the way."""
+"""Where noise is little beside the distances of points, steps are no larger than it, but for points with more of it."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 
 from straightpcf.points.errors import StraightPCFError
-from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
+from straightpcf.service.backends.base import FileJob, FileReport, Listener
 
 CONTENT = b"the result"
 REPORT = FileReport(
@@ -46,7 +46,7 @@ class ObedientBackend:
     patches: what a job that ends well has written beside its result.
     """
 
-    def __init__(self, *outcomes: StraightPCFError | WorkerDied) -> None:
+    def __init__(self, *outcomes: Exception) -> None:
         self.devices: tuple[str, ...] = ("cpu",)
         self.slots, self.restarts = 1, 0
         self.failure: StraightPCFError | None = None

@@ -26,7 +26,6 @@ from straightpcf.points.errors import (
     QuotaExceeded,
     ServerBusy,
     SpoolFull,
-    StraightPCFError,
     TooManyBytes,
     UnknownFormat,
 )
@@ -62,7 +61,7 @@ async def submit(engine: Engine, content: bytes = b"0 0 0\n", **request: Any) ->
         return await engine.submit(path, JobRequest(**{"options": DenoiseOptions()} | request))
 
 
-def play(folder: Path, scenario: Scenario, *outcomes: StraightPCFError | WorkerDied, **limits: Any) -> None:
+def play(folder: Path, scenario: Scenario, *outcomes: Exception, **limits: Any) -> None:
     async def scene() -> None:
         backend = ObedientBackend(*outcomes)
         async with running(folder, backend, **limits) as engine:
@@ -322,6 +321,7 @@ def test_a_job_whose_end_cannot_be_written_runs_again_while_the_server_is_busy(
     monkeypatch.setattr(runner, "LEASE_SECONDS", 0.3)
     monkeypatch.setattr(runner, "HEARTBEAT_SECONDS", 0.05)
     monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
+    monkeypatch.setattr(runner, "END_TRIES", 3)
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         first, _ = await submit(engine)
@@ -343,6 +343,37 @@ def test_a_job_whose_end_cannot_be_written_runs_again_while_the_server_is_busy(
         assert (await engine.get(first.id)).attempts == 2
 
     play(tmp_path, scenario)
+
+
+def test_an_end_that_finds_no_room_is_written_when_there_is_some_and_nothing_is_computed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine)
+        backend.go.set()
+        await until(lambda: backend.runs)
+        await engine._call(fill, record.id)
+        backend.finish.set()
+        await asyncio.sleep(0.3)
+        assert (await engine.get(record.id)).state == "processing"
+        await engine._call(make_room)
+        ended = await engine.wait(record.id)
+        assert (ended.state, ended.attempts, len(backend.runs)) == ("succeeded", 1, 1)
+
+    play(tmp_path, scenario)
+
+
+def test_a_fault_of_the_server_ends_the_job_and_not_the_server(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        ended = await engine.wait((await submit(engine))[0].id)
+        assert (ended.state, type(ended.error), ended.attempts) == ("failed", InternalError, 1)
+        assert (await engine.wait((await submit(engine))[0].id)).state == "succeeded"
+
+    play(tmp_path, scenario, ZeroDivisionError("a bug"))
 
 
 def test_a_cancel_that_comes_between_a_claim_and_the_jobs_first_step_ends_it(
