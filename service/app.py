@@ -59,7 +59,8 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
             yield
         finally:
             if grpc is not None:
-                await grpc.stop(patience_seconds=settings.shutdown_seconds)
+                engine.drain()
+                await grpc.stop(patience_seconds=engine.patience_seconds)
             await engine.stop()
 
     app = FastAPI(

@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import re
+import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -74,7 +75,7 @@ class Engine:
     def __init__(self, backend: Backend, *, limits: Limits, data_dir: Path) -> None:
         self.backend = backend
         self.limits = limits
-        self.draining = False
+        self._ends_at: float | None = None  # time.monotonic(), once it drains
         self._data_dir = data_dir
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="job-store")  # SQLite blocks, the event loop must not
         self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
@@ -105,7 +106,18 @@ class Engine:
 
     def drain(self) -> None:
         """Take nothing new from now on; what runs goes on."""
-        self.draining = True
+        if self._ends_at is None:
+            self._ends_at = time.monotonic() + self.limits.shutdown_seconds
+
+    @property
+    def draining(self) -> bool:
+        """Whether nothing new is taken."""
+        return self._ends_at is not None
+
+    @property
+    def patience_seconds(self) -> float:
+        """How long what runs may go on: one limit for requests, calls and jobs, from the moment that it drains."""
+        return self.limits.shutdown_seconds if self._ends_at is None else max(0.0, self._ends_at - time.monotonic())
 
     async def stop(self) -> None:
         """Let running jobs finish for a while, put the others back into the queue, and end the backend."""
@@ -113,7 +125,7 @@ class Engine:
         if self._sweeper is not None:
             self._sweeper.cancel()
             await asyncio.wait([self._sweeper])
-        await self._runner.stop(patience_seconds=self.limits.shutdown_seconds)
+        await self._runner.stop(patience_seconds=self.patience_seconds)
         await self.backend.stop()
         await self._call(JobStore.close)
         self._thread.shutdown()

@@ -498,3 +498,16 @@ def test_a_file_of_a_newer_schema_is_refused(tmp_path: Path) -> None:
         db.execute("PRAGMA user_version = 99")
     with pytest.raises(InvalidOptions, match="99"):
         JobStore(tmp_path / "jobs.sqlite3")
+
+
+def test_what_runs_has_one_limit_from_the_moment_that_a_server_drains(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        assert engine.patience_seconds == 60
+        engine.drain()
+        await asyncio.sleep(0.2)
+        engine.drain()  # again, by whoever stops next
+        assert 0 < engine.patience_seconds <= 59.8
+        engine._ends_at = 0.0
+        assert engine.patience_seconds == 0
+
+    play(tmp_path, scenario, shutdown_seconds=60.0)
