@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from straightpcf.model.neighbourhoods import inner_points, neighbourhoods
 from straightpcf.model.patches import Patches
@@ -21,11 +22,12 @@ Floats = npt.NDArray[np.float64]
 
 _AROUND, _TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
 _RIDGE = 1e-9  # points in a line have a surface, too; in units of the neighbourhood's radius
-# The noise of a patch is what a quarter of its surfaces leave, or less: the others have edges, bends and thin parts.
-_SHARE = 0.25
+# The noise of so many points near each other is what a quarter of their surfaces leave, or less: the others have edges,
+# bends and thin parts. It is not that of the whole patch, for noise may differ from place to place.
+_SHARE, _PLACE = 0.25, 80
 # Noise beside the radius of the 16: up to the first a cloud is quiet, from the second on it is not at all.
 _QUIET, _LOUD = 0.05, 0.08
-# A point so many times the patch's noise from its neighbours' surface, of which the network takes off so much, is one
+# A point so many times that noise from its neighbours' surface, of which the network takes off so much, is one
 # with more noise than the others.
 _OUT, _TAKEN_BACK = 6.0, 0.6
 _LEAST_OF_OTHERS = 0.1  # of a point's residual, what the fit to itself has left
@@ -64,13 +66,15 @@ def tempered(step: Floats, around: Floats, quiet: float) -> Floats:
     around: (P, 3), a patch, of which the first n >= 1 points make the step. Of moves m across the surface, with noise
     n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent of the noise.
     """
-    here = _surfaces(around[: len(step)], around)
-    noise = np.quantile(here.stds, _SHARE)
+    points = around[: len(step)]
+    here = _surfaces(points, around)
     rise = (step * here.normals).sum(axis=1)
-    weight = min(1.0, noise**2 / max(float(np.square(rise).mean()), np.finfo(np.float64).tiny))
+    _, place = cKDTree(points).query(points, k=np.arange(1, min(_PLACE, len(points)) + 1))
+    noise = np.quantile(here.stds[place], _SHARE, axis=1)
+    moves = np.square(rise)[place].mean(axis=1)
+    weight = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
     out = (np.abs(here.own) > _OUT * noise) & (-rise * here.own > _TAKEN_BACK * here.own**2)
-    weights = np.where(out, 1.0, 1.0 - quiet * (1.0 - weight))
-    less: Floats = step * weights[:, None]
+    less: Floats = step * np.where(out, 1.0, 1.0 - quiet * (1.0 - weight))[:, None]
     return less
 
 

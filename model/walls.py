@@ -20,13 +20,14 @@ Floats = npt.NDArray[np.float64]
 
 # Of 24 the plane lies along walls that are up to 1.2 times as far apart as points, of 64 up to twice as far.
 _AROUND = (24, 64)
-# The share of neighbours nearer to their plane than half of their std: 0.31 and more of one surface with any noise,
-# 0.02 to 0.27 of walls. A sharp rim with noise has few, too, in some of a cloud's patches.
-_MIDWAY, _FEW, _MAY_BE_FEW, _SOME = 0.5, 0.28, 0.3, 0.2
+# The share of neighbours nearer to their plane than half of their std: 0.31 and more of one surface with noise,
+# 0.29 where that is uniform along one axis, 0.02 to 0.28 of walls. A sharp rim with noise has few, too, in some of a
+# cloud's patches, so it has walls where that is so of a fifth of them.
+_MIDWAY, _FEW, _MAY_BE_FEW, _SOME = 0.5, 0.27, 0.28, 0.2
 _THICK = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
-# Moves across, in that std, up to which all is made of them, and nothing from twice as many on: as many as the noise
+# Moves across, in that std, up to which all is made of them, and nothing from 1.5 times as many on: as many as noise
 # asks for, of which the share midway says how much there is.
-_MORE, _PER_MIDWAY = 0.14, 1.3
+_MORE, _PER_MIDWAY, _RAMP = 0.14, 1.3, 0.5
 _INNER, _SAMPLES = 1 / 3, 128
 
 
@@ -34,13 +35,13 @@ _INNER, _SAMPLES = 1 / 3, 128
 class _Heights:
     """What the neighbours of n points have as heights over their planes.
 
-    midway: the share of them that are; std, thick: of half of the points or less, by itself and beside the
-    neighbourhood's radius; normals: (n, 3), the planes'.
+    thick: (n,) bool, whether the neighbours have more height than an edge; midway: the share of those of thick points
+    that are; std: of half of the thick points, or less; normals: (n, 3), the planes'.
     """
 
+    thick: npt.NDArray[np.bool_]
     midway: float
     std: float
-    thick: float
     normals: Floats
 
     @classmethod
@@ -49,19 +50,23 @@ class _Heights:
         near = neighbourhoods(points, around, count)
         height = near.along_axes()[:, :, 0]
         stds = np.sqrt(np.square(height).mean(axis=1))
-        midway = float(np.mean(np.abs(height) < _MIDWAY * stds[:, None]))
-        return cls(midway, float(np.median(stds)), float(np.median(stds / near.radii)), near.normals)
+        thick = stds > _THICK * near.radii
+        if not thick.any():
+            return cls(thick, 1.0, 0.0, near.normals)
+        midway = float(np.mean(np.abs(height[thick]) < _MIDWAY * stds[thick, None]))
+        return cls(thick, midway, float(np.median(stds[thick])), near.normals)
 
     def are_walls(self, few: float) -> bool:
-        return self.midway < few and self.thick > _THICK
+        return self.midway < few and bool(self.thick.mean() > 0.5)
 
     def share_left(self, step: Floats) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together."""
-        if not self.are_walls(_FEW):
+        thick = self.thick[: len(step)]
+        if not self.are_walls(_FEW) or not thick.any():
             return 1.0
-        rise = (step * self.normals[: len(step)]).sum(axis=1)
+        rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
         most = (_MORE + _PER_MIDWAY * self.midway) * self.std
-        return float(np.clip(2.0 - np.sqrt(np.square(rise).mean()) / most, 0.0, 1.0))
+        return float(np.clip(1.0 - (np.sqrt(np.square(rise).mean()) / most - 1.0) / _RAMP, 0.0, 1.0))
 
 
 def has_walls(xyz: Floats, patches: Patches) -> bool:

@@ -62,3 +62,11 @@ def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
 def test_few_points_with_hardly_any_noise_stay_where_they_are(clean: np.ndarray, moved: float, at_most: float) -> None:
     result = load_filter(threads=2).denoise(noisy(clean, moved))
     assert chamfer_distance(result.xyz, clean) < at_most
+
+
+def test_noise_that_half_of_a_surface_has_is_taken_off_there() -> None:
+    clean = even_sphere(900)
+    noise = noisy(clean, 0.02) - clean
+    rough = clean + np.where(clean[:, :1] > 0, noise, 0.0)
+    result = load_filter(threads=2).denoise(rough)
+    assert chamfer_distance(result.xyz, clean) < 0.65 * chamfer_distance(rough, clean)

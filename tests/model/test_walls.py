@@ -52,3 +52,10 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
     result = load_filter(threads=2).denoise(rough)
     assert chamfer_distance(result.xyz, clean) <= 1.05 * chamfer_distance(rough, clean)
     assert any("walls closer together" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_that_half_of_a_sheet_has_is_not_two_walls(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sheet = np.column_stack([rng.uniform(-1, 1, (700, 2)), np.zeros(700)])
+    assert not walls(sheet + 0.06 * np.where(sheet[:, :1] > 0, rng.standard_normal(sheet.shape), 0.0))
