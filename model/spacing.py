@@ -52,7 +52,7 @@ def is_scattered(xyz: npt.NDArray[np.float64], patches: Patches, noise_std: floa
     size = patches.index.shape[1]
     if size < _LEAST:
         return False
-    inner = [(points, some) for points, some in inner_points(xyz, patches)]
+    inner = list(inner_points(xyz, patches))
     step = max(1, sum(len(some) for _, some in inner) // _SAMPLES)
     areas = np.concatenate([_areas(some[::step], points) for points, some in inner])
     nearest, few, many = np.maximum(areas.T, 1e-300)

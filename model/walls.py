@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.neighbourhoods import inner_points, neighbourhoods
+from straightpcf.model.neighbourhoods import INNER, Neighbourhoods, inner_points, nested_neighbourhoods
 from straightpcf.model.patches import Patches
 
 __all__ = ["has_walls", "share_between_walls"]
@@ -28,7 +28,7 @@ _THICK = 0.1  # of the neighbourhood's radius, the std of the heights: what is t
 # Moves across, in that std, up to which all is made of them, and nothing from 1.5 times as many on: as many as noise
 # asks for, of which the share midway says how much there is.
 _MORE, _PER_MIDWAY, _RAMP = 0.14, 1.3, 0.5
-_INNER, _SAMPLES = 1 / 3, 128
+_SAMPLES = 128  # points of a patch that are looked at
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,8 @@ class _Heights:
     normals: Floats
 
     @classmethod
-    def of(cls, points: Floats, around: Floats, count: int) -> _Heights:
-        """Look at points (n, 3) and `count` neighbours of each in `around` (P, 3)."""
-        near = neighbourhoods(points, around, count)
+    def of(cls, near: Neighbourhoods) -> _Heights:
+        """Look at the neighbourhoods of n points."""
         height = near.along_axes()[:, :, 0]
         stds = np.sqrt(np.square(height).mean(axis=1))
         thick = stds > _THICK * near.radii
@@ -74,7 +73,8 @@ def has_walls(xyz: Floats, patches: Patches) -> bool:
     found = []
     for points, inner in inner_points(xyz, patches):
         some = inner[:: max(1, len(inner) // _SAMPLES)]
-        found.append([_Heights.of(some, points, count).are_walls(_MAY_BE_FEW) for count in _AROUND])
+        nested = nested_neighbourhoods(some, points, _AROUND)
+        found.append([_Heights.of(near).are_walls(_MAY_BE_FEW) for near in nested])
     return bool(np.mean(found, axis=0).max() > _SOME)
 
 
@@ -83,7 +83,8 @@ def share_between_walls(step: Floats, around: Floats) -> float:
 
     around: (P, 3), a patch, of which the first n >= 1 points make the step.
     """
-    looked_at = np.arange(0, max(len(step), round(_INNER * len(around))))
+    looked_at = np.arange(0, max(len(step), round(INNER * len(around))))
     looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
     some, their_step = around[looked_at], step[looked_at[looked_at < len(step)]]
-    return min(_Heights.of(some, around, count).share_left(their_step) for count in _AROUND)
+    nested = nested_neighbourhoods(some, around, _AROUND)
+    return min(_Heights.of(near).share_left(their_step) for near in nested)

@@ -153,6 +153,8 @@ class JobRunner:
         Where a disk has no room for it, it is tried again under the job's lease, and at last left to the lease's end.
         """
         await asyncio.wait([running.task])
+        if not running.task.cancelled() and isinstance(fault := running.task.exception(), OSError | sqlite3.Error):
+            raise fault  # this server's trouble, and no end to write down
         for _ in range(END_TRIES):
             try:
                 await self._write_end(running)
@@ -178,8 +180,6 @@ class JobRunner:
             case StraightPCFError() as error:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
                 await self._fail(claim, error)
-            case OSError() | sqlite3.Error() as fault:  # this server's trouble
-                raise fault
             case fault:
                 logger.error("job %s: %r%s", claim.record.id, fault, _trace(claim), exc_info=fault)
                 await self._fail(claim, InternalError("the server failed on this job; its log says how"))

@@ -84,6 +84,15 @@ def fill(store: JobStore, id: str) -> None:
                 store._add_event(id, "log", {"level": "warning", "message": "x" * size})
 
 
+async def run_first_and_fill(engine: Engine, backend: ObedientBackend) -> JobRecord:
+    """Let a job's end, which comes when `finish` is set, find no room."""
+    record, _ = await submit(engine)
+    backend.go.set()
+    await until(lambda: backend.runs)
+    await engine._call(fill, record.id)
+    return record
+
+
 def make_room(store: JobStore) -> None:
     store._db.execute("PRAGMA max_page_count = 1000000")
 
@@ -324,10 +333,7 @@ def test_a_job_whose_end_cannot_be_written_runs_again_while_the_server_is_busy(
     monkeypatch.setattr(runner, "END_TRIES", 3)
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
-        first, _ = await submit(engine)
-        backend.go.set()
-        await until(lambda: backend.runs)
-        await engine._call(fill, first.id)
+        first = await run_first_and_fill(engine, backend)
         backend.finish.set()
         await until(lambda: not engine._runner._running)
         backend.finish.clear()
@@ -351,10 +357,7 @@ def test_an_end_that_finds_no_room_is_written_when_there_is_some_and_nothing_is_
     monkeypatch.setattr(runner, "POLL_SECONDS", 0.05)
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
-        record, _ = await submit(engine)
-        backend.go.set()
-        await until(lambda: backend.runs)
-        await engine._call(fill, record.id)
+        record = await run_first_and_fill(engine, backend)
         backend.finish.set()
         await asyncio.sleep(0.3)
         assert (await engine.get(record.id)).state == "processing"
