@@ -9,7 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["replaced_when_complete"]
+__all__ = ["check_target", "replaced_when_complete"]
+
+
+def check_target(path: Path) -> None:
+    """Raise OSError where a file cannot be written or replaced, before work is put into what would be lost."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is no folder to write {path.name} to")
+    if path.exists() and not path.is_file():  # /dev/null, too, would be taken away
+        raise FileExistsError(f"{path} is there and is no file: a result cannot take its place")
 
 
 @contextmanager
@@ -18,6 +26,7 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
 
     A file that is replaced hands on its mode, and a symbolic link stays one: what it points to is replaced.
     """
+    check_target(path)
     target = path.resolve()
     mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
     unfinished = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:12]}.part{target.suffix}")

@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 
 import straightpcf
 from straightpcf.clients import job_commands
+from straightpcf.clients.atomic import check_target, replaced_when_complete
 from straightpcf.clients.console import (
     complain,
     exit_code,
@@ -111,6 +112,8 @@ def denoise(
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
     name = name or (None if source == STDIO else source.name)
+    if target != STDIO:
+        check_target(target)
     if format is not None:
         format = format_named(format).name
     elif target != STDIO and target.suffix.lower() != Path(name or "").suffix.lower():
@@ -325,8 +328,6 @@ def _output(target: Path, suffix: str) -> Iterator[Path]:
     import tempfile
 
     if target != STDIO:
-        if not target.parent.is_dir():
-            raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
         yield target
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -344,8 +345,6 @@ def _copy(source: BinaryIO | Any, target: BinaryIO | Any) -> None:
 
 def _in_process(device: Device, weights: Path | None, threads: int | None) -> Callable[..., Any]:
     """Load the filter and return what denoises one file with it."""
-    from straightpcf.clients.atomic import replaced_when_complete
-
     with needs("model"):
         from straightpcf.model.filter import load_filter
         from straightpcf.service.backends.base import FileJob

@@ -125,8 +125,9 @@ def show_noise(target: object, report: Any) -> None:
     """Sum up on stderr what was done; report: of the SDK or of a worker, they have the same names."""
     for warning in report.warnings:
         typer.echo(f"warning: {warning}", err=True)
+    passes = "1 pass" if report.iterations == 1 else f"{report.iterations} passes"
     typer.echo(
-        f"{target}: {report.points} points, {report.iterations} passes, estimated noise "
+        f"{target}: {report.points} points, {passes}, estimated noise "
         f"{report.noise_before:.4g} -> {report.noise_after:.4g}, {report.seconds:.1f} s",
         err=True,
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from straightpcf.clients.atomic import check_target
 from straightpcf.clients.console import interruptible, print_json, print_table, progress_bar, show_noise
 from straightpcf.points.errors import InvalidOptions
 
@@ -130,7 +131,9 @@ def jobs(
     for info in infos:
         points = "" if info.points is None else f"{info.points:,} points"
         when = info.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
-        typer.echo(f"{info.id:<34}{info.state:<12}{info.progress:>5.0%}  {when}  {info.name or '-'}  {points}".rstrip())
+        typer.echo(
+            f"{info.id:<32}  {info.state:<12}{info.progress:>5.0%}  {when}  {info.name or '-'}  {points}".rstrip()
+        )
 
 
 def result(
@@ -141,11 +144,13 @@ def result(
     as_json: AsJson = False,
 ) -> None:
     """Wait for a job and download its result, whole and checked."""
+    to_stdout = str(target) == "-"
+    if not to_stdout:
+        check_target(target)
     with connect(url, api_key) as client, progress_bar(id) as show:
         job = client.jobs.get(id)
         if not job.info.finished:
             job.wait(on_progress=show)
-        to_stdout = str(target) == "-"
         found = job.result(None if to_stdout else target)
         if to_stdout:
             sys.stdout.buffer.write(found.read())

@@ -79,6 +79,7 @@ class StraightPCFError(Exception):
         super().__init__(message)
         self.message = message
         self.request_id = request_id
+        self.retry_after: int | None = None  # seconds, where it is known what will have changed by then
 
 
 class InvalidRequest(StraightPCFError):  # noqa: N818 - named for what is wrong, as the wire codes are

@@ -12,6 +12,7 @@ __all__ = ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
 
 MAX_ITERATIONS = 10
 MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
+_ITERATIONS, _SEED, _STRENGTH = f'"auto" or 1..{MAX_ITERATIONS}', f"an integer in 0..{2**32 - 1}", "in 0..1"
 _T = TypeVar("_T", int, float)
 
 
@@ -38,11 +39,11 @@ class DenoiseOptions:
             or not isinstance(self.iterations, int)
             or not 1 <= self.iterations <= MAX_ITERATIONS
         ):
-            raise InvalidOptions(f'iterations is {self.iterations!r}; it must be "auto" or 1..{MAX_ITERATIONS}')
+            raise InvalidOptions(f"iterations is {self.iterations!r}; it must be {_ITERATIONS}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
-            raise InvalidOptions(f"seed is {self.seed!r}; it must be an integer in 0..{2**32 - 1}")
+            raise InvalidOptions(f"seed is {self.seed!r}; it must be {_SEED}")
         if not (isinstance(self.strength, (int, float)) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
-            raise InvalidOptions(f"strength is {self.strength!r}; it must be in 0..1")
+            raise InvalidOptions(f"strength is {self.strength!r}; it must be {_STRENGTH}")
         if self.normals not in ("keep", "recompute"):
             raise InvalidOptions(f'normals is {self.normals!r}; it must be "keep" or "recompute"')
 
@@ -59,18 +60,18 @@ class DenoiseOptions:
         default = cls()
         return cls(
             iterations=default.iterations if iterations is None else _iterations(iterations),
-            seed=default.seed if seed is None else _number("seed", int, seed),
-            strength=default.strength if strength is None else _number("strength", float, strength),
+            seed=default.seed if seed is None else _number("seed", int, seed, _SEED),
+            strength=default.strength if strength is None else _number("strength", float, strength, _STRENGTH),
             normals=default.normals if normals is None else normals.strip().lower(),  # type: ignore[arg-type]
         )
 
 
 def _iterations(text: str) -> int | Literal["auto"]:
-    return "auto" if text.strip().lower() == "auto" else _number("iterations", int, text)
+    return "auto" if text.strip().lower() == "auto" else _number("iterations", int, text, _ITERATIONS)
 
 
-def _number(name: str, kind: type[_T], text: str) -> _T:
+def _number(name: str, kind: type[_T], text: str, limit: str) -> _T:
     try:
         return kind(text)
     except ValueError:
-        raise InvalidOptions(f"{name} is {text[:40]!r}; it must be a number") from None
+        raise InvalidOptions(f"{name} is {text[:40]!r}; it must be {limit}") from None

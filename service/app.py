@@ -162,6 +162,8 @@ def _check_start(settings: Settings) -> None:
         JobStore(settings.data_dir / "jobs.sqlite3").close()
     except (OSError, sqlite3.Error) as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
+    if settings.weights is not None and not settings.weights.is_file():
+        raise InvalidOptions(f"weights is {settings.weights}, which is no file")
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     for name in ("port", "grpc_port"):
         if port := getattr(settings, name):

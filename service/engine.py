@@ -6,10 +6,9 @@ import asyncio
 import hashlib
 import json
 import logging
-import re
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ from weakref import WeakValueDictionary
 from straightpcf.points.errors import InvalidRequest, JobExpired, JobNotFinished, ServerBusy
 from straightpcf.points.formats import estimate_points, format_named
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE
 from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.jobs.folders import JobFolders, digest_of
@@ -32,9 +32,10 @@ __all__ = ["Engine", "JobRequest", "Usage"]
 
 # Another server may work on a job of ours, and tells us nothing: readers look again after this.
 POLL_SECONDS = 1.0
+# Who still waits when a server ends is answered so long before what runs is cut off.
+FAREWELL_SECONDS = 1.5 * POLL_SECONDS
 SWEEP_SECONDS = 30.0
 CHUNK_BYTES = 2**20
-_ID = re.compile(r"(?!\.)[A-Za-z0-9._-]{1,64}")
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -160,10 +161,8 @@ class Engine:
         await self._check(size)  # not whether it drains: what was let in before may finish
         if request.format is not None:
             format_named(request.format)  # raises before anything waits
-        if request.id is not None and not _ID.fullmatch(request.id):
-            raise InvalidRequest(
-                f"job id is {request.id[:80]!r}; it must be 1 to 64 of A-Z a-z 0-9 . _ -, no dot first"
-            )
+        if request.id is not None and not JOB_ID.fullmatch(request.id):
+            raise InvalidRequest(f"job id is {request.id[:80]!r}; it must be {JOB_ID_RULE}")
         content, weight = await asyncio.to_thread(
             lambda: (digest_of(source), estimate_points(source, name=request.name))
         )
@@ -222,7 +221,7 @@ class Engine:
         return await self._call(JobStore.page, owner=owner, states=states, limit=limit, cursor=cursor)
 
     async def wait(self, id: str, *, owner: str = "", seconds: float | None = None) -> JobRecord:
-        """Return a job once it is finished, or as it is after `seconds`."""
+        """Return a job once it is finished, or as it is after `seconds`; raises ServerBusy if the server ends first."""
         loop = asyncio.get_running_loop()
         until = None if seconds is None else loop.time() + seconds
         while True:
@@ -231,10 +230,13 @@ class Engine:
             left = POLL_SECONDS if until is None else min(POLL_SECONDS, until - loop.time())
             if record.finished or left <= 0:
                 return record
-            await _first(news, left)
+            await self._further(news, left)
 
-    async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncIterator[JobEvent]:
-        """Yield what happened behind event `after`, and then what happens, until `completed`."""
+    async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncGenerator[JobEvent, None]:
+        """Yield what happened behind event `after`, and then what happens, until `completed`.
+
+        Raises ServerBusy where this server ends first.
+        """
         while True:
             news = self._news_of(id)
             record = await self.get(id, owner=owner)
@@ -243,7 +245,7 @@ class Engine:
                 yield event
             if record.finished:
                 return
-            await _first(news, POLL_SECONDS)
+            await self._further(news)
 
     async def result(self, id: str, *, owner: str = "") -> tuple[Path, JobRecord]:
         """Return the result file; raises JobNotFinished, JobExpired, or what the job failed with."""
@@ -259,7 +261,8 @@ class Engine:
     async def patches(self, id: str, *, owner: str = "") -> AsyncIterator[bytes]:
         """Yield the patch stream (docs/api.md) as it grows; a second attempt goes on where the first one ended.
 
-        That is sound because the same input, options and weights give the same bytes.
+        That is sound because the same input, options and weights give the same bytes. Raises what the job failed with,
+        and ServerBusy where this server ends first.
         """
         sent = 0
         while True:
@@ -271,7 +274,7 @@ class Engine:
                 yield chunk
             if record.finished:
                 break
-            await _first(news, POLL_SECONDS)
+            await self._further(news)
         if record.error is not None:
             raise record.error
         if sent == 0:
@@ -302,6 +305,12 @@ class Engine:
         loop = asyncio.get_running_loop()
         with full_disk_as_spool_full():
             return await loop.run_in_executor(self._thread, lambda: function(self._store, *args, **kwargs))
+
+    async def _further(self, news: asyncio.Event, seconds: float = POLL_SECONDS) -> None:
+        """Return when there may be something new; raises ServerBusy when this server is about to end."""
+        if self.draining and self.patience_seconds < min(FAREWELL_SECONDS, self.limits.shutdown_seconds / 2):
+            raise ServerBusy("the server is shutting down; the job goes on when it is back")
+        await _first(news, seconds)
 
     def _news_of(self, id: str) -> asyncio.Event:
         """Return an event that is set at the next change; take it before looking, so that no change is missed."""

@@ -24,6 +24,8 @@ _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
 )  # fmt: skip
+_SECONDS = ("max_sync_seconds", "result_ttl_seconds", "row_ttl_seconds", "shutdown_seconds")
+_MAX_SECONDS = 1e9  # three decades; infinitely far ahead there is no date
 
 
 def _default_data_dir() -> Path:
@@ -84,6 +86,9 @@ class Settings:
         for name in ("rate_per_minute", "min_free_bytes", "row_ttl_seconds"):
             if getattr(self, name) < 0:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must not be negative")
+        for name in _SECONDS:
+            if not getattr(self, name) <= _MAX_SECONDS:  # NaN is not, either
+                raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be at most {_MAX_SECONDS:.0f}")
         for name in ("port", "grpc_port"):
             if not 0 <= (getattr(self, name) or 0) < 2**16:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
@@ -112,7 +117,9 @@ class Settings:
             name = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
             if name not in kinds:
                 raise InvalidOptions(f"{variable} is no setting; known: {', '.join(sorted(kinds))}")
-            values[name] = _parse(variable, kinds[name], text)
+            # Compose files leave a setting blank to say nothing; keys that are wanted and missing are a fault.
+            if text.strip() or name == "api_keys_file":
+                values[name] = _parse(variable, kinds[name], text)
         values |= {name: value for name, value in overrides.items() if value is not None}
         return cls(**values)
 

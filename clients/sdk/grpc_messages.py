@@ -88,12 +88,14 @@ class Answer:
         self._call, self._receiver = call, receiver
         self._offset = 0
         self._points: int | None = None
+        self._is_empty = True
         if call.rpc not in ("DownloadResult", "StreamPatches"):
             receiver.begin(200, {})
 
     def take(self, message: Any) -> None:
         """Take the next message."""
         receiver = self._receiver
+        self._is_empty = False
         match message:
             case pb.JobEvent():
                 kind, seq, data = event_of(message)
@@ -125,6 +127,8 @@ class Answer:
         """Take the end of a call that went well."""
         if self._points is not None:
             self._receiver.write(encode_end(1))
+        elif self._call.rpc == "WatchJob" and self._is_empty:
+            self._receiver.begin(204, {})  # as REST says that nothing is left to tell
         return self._receiver.finish()
 
     def _begin_file(self, result: pb.ResultInfo) -> None:

@@ -11,6 +11,7 @@ from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.response import failed_connection, failed_response
 from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport
+from straightpcf.points.errors import InvalidRequest
 
 __all__ = ["CONNECT_TIMEOUT_SECONDS", "AsyncHttpTransport", "HttpTransport"]
 
@@ -36,7 +37,8 @@ class HttpTransport(Transport):
             with call.open_body() as body, self._http.stream(**asked, content=body) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
-                    for item in httpx2.EventSource(response) if call.events else response.iter_bytes():
+                    has_events = call.events and response.status_code != 204
+                    for item in httpx2.EventSource(response) if has_events else response.iter_bytes():
                         receiver.write(item)
                         yield
                     attempts.failure = receiver.finish()
@@ -65,7 +67,8 @@ class AsyncHttpTransport(AsyncTransport):
             async with self._http.stream(**asked, content=call.stream_body()) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
-                    async for item in httpx2.EventSource(response) if call.events else response.aiter_bytes():
+                    has_events = call.events and response.status_code != 204
+                    async for item in httpx2.EventSource(response) if has_events else response.aiter_bytes():
                         receiver.write(item)
                         yield
                     attempts.failure = receiver.finish()
@@ -77,8 +80,12 @@ class AsyncHttpTransport(AsyncTransport):
 
 
 def _options(url: str, api_key: str | None, timeout: float | None) -> dict[str, Any]:
+    try:
+        base = httpx2.URL(url)
+    except httpx2.InvalidURL as exc:
+        raise InvalidRequest(f"{url[:80]!r} is no address of a server: {exc}") from exc
     return {
-        "base_url": url,
+        "base_url": base,
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
         "timeout": _silence(timeout),
     }

@@ -74,13 +74,15 @@ class Events:
         self.furthest = after
         self.value: Any = None
         self._came: list[Event] = []
+        self._is_over = False
 
     def headers(self) -> Mapping[str, str]:
         """Go on behind the last event that arrived."""
         return {"Last-Event-ID": str(self.furthest)} if self.furthest else {}
 
     def begin(self, status: int, headers: Mapping[str, str]) -> None:
-        """Nothing to prepare."""
+        """Take the head of a response: 204 says that `completed` was the last event that arrived."""
+        self._is_over = status == 204
 
     def write(self, item: Any) -> None:
         """Take one server-sent event."""
@@ -99,7 +101,7 @@ class Events:
 
     def finish(self) -> Failure | None:
         """Miss the `completed` event, if it did not come."""
-        if self.value is not None:
+        if self.value is not None or self._is_over:
             return None
         return Failure(error=ConnectionFailed("the events broke off before the job was finished"), retryable=True)
 

@@ -10,15 +10,16 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal, TypeAlias
-from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.errors import InvalidCloud, InvalidRequest
+from straightpcf.clients.atomic import check_target
+from straightpcf.points.errors import InvalidCloud, InvalidRequest, NotFound
 from straightpcf.points.formats import format_for, format_named, recognised
 from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE, STATES
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 CHUNK_BYTES = 2**18
+MAX_PAGE_SIZE = 200
 STREAM_SECONDS = 60.0  # a stream is silent while its job waits; of events something comes every 15
 
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.
@@ -108,8 +110,8 @@ def upload_call(
     options = DenoiseOptions.parse(
         iterations=str(iterations), seed=str(seed), strength=str(strength), normals=str(normals)
     )
-    if target is not None and not target.parent.is_dir():
-        raise FileNotFoundError(f"{target.parent} is no folder to write {target.name} to")
+    if target is not None:
+        check_target(target)
     own_name, body = _name_and_body(source)
     name = name or own_name
     if name is None and isinstance(body, bytes):
@@ -130,6 +132,8 @@ def upload_call(
         **({} if key is None else {"Idempotency-Key": key}),
     }
     id = id or uuid.uuid4().hex
+    if not JOB_ID.fullmatch(id):
+        raise InvalidRequest(f"job id is {id[:80]!r}; it must be {JOB_ID_RULE}")
     fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id}
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
     return Call(method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body)
@@ -147,7 +151,11 @@ def job_call(id: str, *, wait: float = 0.0) -> Call:
 
 
 def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
-    """Build the request for one page of jobs."""
+    """Build the request for one page of jobs; raises InvalidRequest."""
+    if unknown := set(states) - set(STATES):
+        raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
+    if not 1 <= limit <= MAX_PAGE_SIZE:
+        raise InvalidRequest(f"page_size is {limit}; it must be in 1..{MAX_PAGE_SIZE}")
     params: dict[str, str | list[str]] = {"limit": str(limit)}
     if states:
         params["state"] = list(states)
@@ -193,12 +201,16 @@ def delete_call(id: str, *, timeout: float | None = None) -> Call:
 
 
 def _job(id: str, part: str = "") -> str:
-    return f"/jobs/{quote(id, safe='')}" + (f"/{part}" if part else "")
+    if not JOB_ID.fullmatch(id):  # it would name another path: "" the list of jobs, ".." the page
+        raise NotFound(f"there is no job {id[:64]!r}; an id is {JOB_ID_RULE}")
+    return f"/jobs/{id}" + (f"/{part}" if part else "")
 
 
 def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     if isinstance(source, str | Path):
         path = Path(source)
+        if not path.is_file():  # a pipe has no size to declare, and cannot be sent again
+            raise FileNotFoundError(f"{path} is no file")
         return path.name, path
     if isinstance(source, bytes | bytearray | memoryview):
         return None, bytes(source)

@@ -70,6 +70,8 @@ def failed_response(response: httpx2.Response) -> Failure:
     request_id = problem.get("request_id") or response.headers.get("X-Request-Id")
     kind = ERRORS_BY_CODE.get(str(problem.get("code")), _kind_of_status(response.status_code))
     detail = str(problem.get("detail") or f"HTTP {response.status_code} {response.reason_phrase}")
+    if response.is_redirect and (place := response.headers.get("Location")):
+        detail += f" to {place[:200]}: give the address that it ends at"
     return Failure(
         error=kind(detail, request_id=request_id),
         retryable=bool(problem.get("retryable", response.status_code in (429, 503))),
@@ -96,7 +98,7 @@ def _kind_of_status(status: int) -> type[StraightPCFError]:
         return TooManyBytes
     if status in (429, 503):
         return ServerBusy
-    return InvalidRequest if 400 <= status < 500 else InternalError
+    return InvalidRequest if 300 <= status < 500 else InternalError
 
 
 def _seconds(headers: Mapping[str, str]) -> float | None:

@@ -7,12 +7,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Iterator
 from typing import TypeVar
+from urllib.parse import urlsplit
 
 from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure, next_delay
-from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.errors import InvalidOptions, InvalidRequest
 
 __all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async"]
 
@@ -20,8 +21,11 @@ _T = TypeVar("_T")
 
 
 def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> Transport:
-    """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`; raises InvalidOptions."""
-    _check_key(api_key)
+    """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`.
+
+    Raises InvalidOptions, InvalidRequest for a key and a URL that cannot be.
+    """
+    _check(url, api_key)
     if _is_grpc(url):
         from straightpcf.clients.sdk.grpc_transport import GrpcTransport
 
@@ -33,7 +37,7 @@ def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries
 
 def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> AsyncTransport:
     """Do as `connect`."""
-    _check_key(api_key)
+    _check(url, api_key)
     if _is_grpc(url):
         from straightpcf.clients.sdk.grpc_transport import AsyncGrpcTransport
 
@@ -43,9 +47,15 @@ def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_r
     return AsyncHttpTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
 
 
-def _check_key(api_key: str | None) -> None:
+def _check(url: str, api_key: str | None) -> None:
+    try:
+        _ = urlsplit(url).port
+    except ValueError as exc:
+        raise InvalidRequest(f"{url[:80]!r} is no address of a server: {exc}") from exc
     if api_key is not None and not (api_key.isascii() and api_key.isprintable()):
         raise InvalidOptions("the API key holds more than printable ASCII, which no header can carry")
+    if api_key is not None and (not api_key or api_key != api_key.strip()):
+        raise InvalidOptions("the API key is empty, or begins or ends with a space")
 
 
 def _is_grpc(url: str) -> bool:

@@ -98,21 +98,20 @@ def recognised(head: bytes, called: str | None) -> Format:
 
     Raises UnknownFormat, MalformedFile if it is empty.
     """
+    name = PurePath(called or "the cloud").name
     if not head:
-        raise MalformedFile(f"{called or 'the cloud'} is empty (0 bytes)")
+        raise MalformedFile(f"{name[:80]} is empty (0 bytes)")
     for format in FORMATS:
         if format.has_magic and format.sniff(head):
             return format
-    suffix = PurePath(called or "").suffix.lower()
+    begins, suffix = f"{name[:80]} begins with {head[:8]!r}, which no format does", PurePath(name).suffix.lower()
     for format in FORMATS:
-        if not format.has_magic and suffix in format.suffixes:
-            return format
-    if called is None:
-        raise UnknownFormat(f"the cloud begins with {head[:8]!r}, which no format does: it needs a name with a suffix")
-    raise UnknownFormat(
-        f"{PurePath(called).name[:80]} begins with {head[:8]!r}, which no format does, and its suffix names none; "
-        f"there are {_known()}"
-    )
+        if suffix in format.suffixes:
+            if not format.has_magic:
+                return format
+            raise UnknownFormat(f"{begins}: it is no {format.name} file, whatever its suffix says")
+    wants = "and its suffix names none" if suffix else "so it needs a name with a suffix that says its format"
+    raise UnknownFormat(f"{begins}, {wants}; there are {_known()}")
 
 
 def _known() -> str:

@@ -1,11 +1,14 @@
-"""The words for a job that server and clients share: its states, and what a result file is."""
+"""The words for a job that server and clients share: its id, its states, and what a result file is."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-__all__ = ["FINISHED", "STATES", "JobState", "ResultInfo"]
+__all__ = ["FINISHED", "JOB_ID", "JOB_ID_RULE", "STATES", "JobState", "ResultInfo"]
+
+JOB_ID, JOB_ID_RULE = re.compile(r"(?!\.)[A-Za-z0-9._-]{1,64}"), "1 to 64 of A-Z a-z 0-9 . _ -, no dot first"
 
 JobState = Literal["queued", "starting", "processing", "succeeded", "failed", "canceled", "expired"]
 STATES: tuple[JobState, ...] = get_args(JobState)

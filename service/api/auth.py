@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import math
 import time
 from typing import Annotated
 
@@ -60,7 +61,9 @@ class Gate:
         # What is refused takes nothing: whoever asks again too soon would never get in.
         self._buckets[owner] = (left - 1 if granted else left, now)
         if not granted:
-            raise RateLimited(f"this key may send {self._rate} requests a minute")
+            error = RateLimited(f"this key may send {self._rate} requests a minute")
+            error.retry_after = math.ceil((1 - left) * _SECONDS / self._rate)
+            raise error
 
 
 def owner_of(request: Request, _: Annotated[object, Depends(_BEARER)]) -> str:

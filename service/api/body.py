@@ -11,7 +11,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, UnknownFormat
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.disposition import disposition_name
 
@@ -40,8 +40,11 @@ def declared_size(request: Request) -> int:
 async def receive_upload(request: Request, target: Path, *, limits: Limits) -> Upload:
     """Write the request's file to `target`: a form's part named "file", or any other body as it is.
 
-    Raises TooManyBytes, InvalidRequest; ClientDisconnect if the client goes away.
+    Raises TooManyBytes, UnknownFormat, InvalidRequest; ClientDisconnect if the client goes away.
     """
+    coding = request.headers.get("content-encoding", "identity")
+    if coding.strip().lower() not in ("", "identity"):
+        raise UnknownFormat(f"the body is encoded as {coding[:40]!r}; send it as it is")
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     with await asyncio.to_thread(target.open, "wb") as file:
         spool = SpoolFile(file)
@@ -150,6 +153,8 @@ class _Form:
 
     def _on_part_end(self) -> None:
         if self._sink is not self._file:
+            if self._name in self.upload.fields:
+                raise InvalidOptions(f"{self._name[:40]!r} is said 2 times; which one is meant?")
             self.upload.fields[self._name] = _text(self._sink)
             if len(self.upload.fields) > MAX_FIELDS:
                 raise InvalidRequest(f"the form has more than {MAX_FIELDS} fields")

@@ -156,7 +156,9 @@ def problem_response(
         retryable=error.retryable,
         request_id=request_id(request),
     )
-    own = {HEADER: request_id(request)} | ({"Retry-After": str(RETRY_AFTER_SECONDS)} if error.retryable else {})
+    own = {HEADER: request_id(request)}
+    if error.retryable:
+        own["Retry-After"] = str(error.retry_after or RETRY_AFTER_SECONDS)
     if status == 401:
         own["WWW-Authenticate"] = "Bearer"
     return JSONResponse(

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 
 from starlette.responses import StreamingResponse
 
-from straightpcf.points.errors import InvalidRequest, NotFound, StraightPCFError
+from straightpcf.points.errors import InvalidRequest, NotFound, ServerBusy, StraightPCFError
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE, PatchReader
 from straightpcf.service.api.schemas import Job
 from straightpcf.service.engine import Engine
@@ -42,8 +42,8 @@ async def _events(engine: Engine, id: str, owner: str, after: int) -> AsyncItera
             if event.kind == "completed":
                 data = Job.of(await engine.get(id, owner=owner)).plain()
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n".encode()
-    except NotFound:
-        return  # deleted while we looked
+    except (NotFound, ServerBusy):
+        return  # deleted while we looked, or the server ends: without `completed`, so that a client comes again
 
 
 async def _kept_alive(events: AsyncIterator[bytes]) -> AsyncIterator[bytes]:

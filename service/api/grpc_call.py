@@ -73,7 +73,8 @@ async def _abort(context: Context, error: StraightPCFError, request_id: str) -> 
     metadata = {"retryable": str(error.retryable).lower(), "request_id": request_id}
     details = [error_details_pb2.ErrorInfo(reason=error.code.upper(), domain=DOMAIN, metadata=metadata)]
     if error.retryable:
-        details.append(error_details_pb2.RetryInfo(retry_delay=Duration(seconds=RETRY_AFTER_SECONDS)))
+        delay = Duration(seconds=error.retry_after or RETRY_AFTER_SECONDS)
+        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
     rich = status_pb2.Status(code=code_pb2.Code.Value(code), message=error.message)
     for detail in details:
         (packed := AnyMessage()).Pack(detail)

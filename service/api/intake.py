@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath, PureWindowsPath
 
 from starlette.requests import Request
@@ -29,10 +30,13 @@ async def take_job(
     engine: Engine = request.app.state.engine
     await engine.check_room(size=declared_size(request))
     key = checked_key(request.headers.get("idempotency-key"))
-    _parse_fields(request.query_params, more_fields)  # before the body, so that it need not be read
+    query = request.query_params
+    _check_once([name for name, _ in query.multi_items()])  # before the body, so that it need not be read
+    _parse_fields(query, more_fields)
     with engine.upload() as source:
         upload = await receive_upload(request, source, limits=engine.limits)
-        fields = {**request.query_params, **upload.fields}
+        _check_once([*query, *upload.fields])
+        fields = {**query, **upload.fields}
         options, format = _parse_fields(fields, more_fields)
         wanted = JobRequest(
             options=options,
@@ -54,6 +58,12 @@ def flag(fields: Mapping[str, str], name: str) -> bool:
     if text not in ("true", "false", "1", "0"):
         raise InvalidOptions(f"{name} is {text[:40]!r}; it must be true or false")
     return text in ("true", "1")
+
+
+def _check_once(names: Sequence[str]) -> None:
+    if len(set(names)) < len(names):
+        name, times = Counter(names).most_common(1)[0]
+        raise InvalidOptions(f"{name[:40]!r} is said {times} times; which one is meant?")
 
 
 def _parse_fields(fields: Mapping[str, str], more: frozenset[str]) -> tuple[DenoiseOptions, str | None]:

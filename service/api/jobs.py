@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import aclosing
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -73,7 +74,7 @@ async def list_jobs(
 
 
 @router.head("/jobs/{id}", include_in_schema=False)
-@router.get("/jobs/{id}", response_model=Job, responses=problems(400, 401, 404), summary="Look at a job")
+@router.get("/jobs/{id}", response_model=Job, responses=problems(400, 401, 404, 503), summary="Look at a job")
 async def get_job(
     id: str,
     request: Request,
@@ -94,8 +95,12 @@ async def job_events(
 ) -> Response:
     """Send what happened so far and what happens next as server-sent events; `Last-Event-ID` goes on behind one."""
     engine: Engine = request.app.state.engine
-    await engine.get(id, owner=owner)
+    record = await engine.get(id, owner=owner)
     from_id = last_event_id(request.headers.get("last-event-id"), after)
+    if record.finished:
+        async with aclosing(engine.events(id, owner=owner, after=from_id)) as events:
+            if await anext(events, None) is None:
+                return Response(status_code=204)  # which ends an EventSource; it connects again after anything else
     return event_stream(engine, id, owner, after=from_id, headers={})
 
 
@@ -131,7 +136,10 @@ router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="h
 
 
 @router.head("/jobs/{id}/report", include_in_schema=False)
-@router.get("/jobs/{id}/report", response_model=Report, responses=problems(401, 404, 409, 410), summary="The report")
+@router.get(
+    "/jobs/{id}/report", response_model=Report, summary="The report",
+    responses=problems(401, 404, 409, 410, 413, 415, 500),
+)  # fmt: skip
 async def job_report(id: str, request: Request, owner: Owner) -> Report:
     """Show displacement, noise before and after, passes, timings and warnings."""
     engine: Engine = request.app.state.engine

@@ -130,14 +130,25 @@ def _form_body(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
 JOB_BODY = _form_body(_OPTIONS)
 DENOISE_FORM_BODY = _form_body({**_OPTIONS, "report": _REPORT})
 
+_SHA256 = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 _RESULT_HEADERS = {
     "X-Request-Id": ("The id of this request, also in every problem.", "string", "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"),
+    "X-Job-Id": ("The job that made it.", "string", "c53b6bb26ca24d55af66ff11d0fa5dea"),
     "X-Points": ("Points in, and points out.", "integer", 10000),
     "X-Iterations": ("Passes of the filter.", "integer", 2),
     "X-Noise-Before": ("Estimated noise of the input, in the cloud's unit; nan if unknown.", "string", "0.0123"),
     "X-Noise-After": ("Estimated noise of the result.", "string", "0.0021"),
     "X-Untouched": ("Points that were NaN or infinite, and passed through.", "integer", 0),
     "Content-Disposition": ("The name of the result.", "string", 'attachment; filename="scan_clean.ply"'),
+    "ETag": ("The sha256 of the result in hex.", "string", f'"{_SHA256}"'),
+    "Repr-Digest": ("The same as RFC 9530 has it.", "string", "sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"),
+}
+_FILE: dict[str, Any] = {
+    "content": {"application/octet-stream": _RAW},
+    "headers": {
+        name: {"description": description, "schema": {"type": kind}, "example": example}
+        for name, (description, kind, example) in _RESULT_HEADERS.items()
+    },
 }
 
 
@@ -191,14 +202,10 @@ _LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type":
 DENOISE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The cloud, in the requested format.",
-        "content": {"application/octet-stream": _RAW},
-        "headers": {
-            name: {"description": description, "schema": {"type": kind}, "example": example}
-            for name, (description, kind, example) in _RESULT_HEADERS.items()
-        },
+        **_FILE,
     },
     202: {
-        "description": "The job, if it was preferred so or took longer than this server lets a request wait.",
+        "description": "The job, if it was preferred so, took longer than this server lets a request wait, or it ends.",
         "content": _JOB,
         "headers": _LOCATION,
     },
@@ -212,8 +219,8 @@ JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 RESULT_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"description": "The cloud.", "content": {"application/octet-stream": _RAW}},
-    206: {"description": "The part that was asked for.", "content": {"application/octet-stream": _RAW}},
+    200: {"description": "The cloud.", **_FILE},
+    206: {"description": "The part that was asked for.", **_FILE},
     304: {"description": "What If-None-Match names is still the result."},
     **problems(400, 401, 404, 409, 410, 413, 415, 416, 500),
 }
@@ -223,6 +230,7 @@ EVENTS_RESPONSES: dict[int | str, dict[str, Any]] = {
         "description": "Events `queued start progress preview output log completed`; docs/api.md says what is in each.",
         "content": {"text/event-stream": {"schema": {"type": "string"}}},
     },
+    204: {"description": "It is finished, and nothing happened behind `Last-Event-ID`."},
     **problems(400, 401, 404),
 }
 

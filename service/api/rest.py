@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect
 
+from straightpcf.points.errors import ServerBusy
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import report_and_file, result_response
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
@@ -43,6 +44,9 @@ Owner = Annotated[str, Depends(owner_of)]
 )
 @router.post("/denoise/{filename}", include_in_schema=False, response_class=Response)
 @router.put("/denoise", include_in_schema=False, response_class=Response)
+# `curl -T - URL/denoise/` appends no name, and curl takes a redirect for an answer.
+@router.post("/denoise/", include_in_schema=False, response_class=Response)
+@router.put("/denoise/", include_in_schema=False, response_class=Response)
 @router.put(
     "/denoise/{filename}",
     summary="Denoise one point cloud (what `curl -T scan.ply URL/denoise/` sends)",
@@ -76,6 +80,8 @@ async def denoise(request: Request, owner: Owner) -> Response:
         if private:
             await engine.delete(record.id, owner=owner)
         raise
+    except ServerBusy:  # it shuts down: the job is done at its next start
+        record = await engine.get(record.id, owner=owner)
     applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
         return job_response(record, 202, applied)

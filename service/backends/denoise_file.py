@@ -42,7 +42,7 @@ def denoise_file(
     from straightpcf.model.normals import recompute_normals
 
     began = time.monotonic()
-    cloud, source_format = read_cloud(job.source, name=job.name, max_points=job.max_points)
+    cloud, source_format = read_cloud(job.source, name=job.name or "the cloud", max_points=job.max_points)
     target_format = source_format if job.format is None else format_named(job.format)
     if job.options.normals == "recompute":
         _check_normals(cloud, target_format)

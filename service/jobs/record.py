@@ -20,8 +20,8 @@ class JobRecord:
     """Hold one job as it is in the store; times in UTC.
 
     owner: the fingerprint of the key that made it, "" without keys. folder: the name of its folder of files. bytes,
-    points: of the input, points None until it was read. attempts: how often a worker took it. position: jobs before
-    it while it is queued. error: of a failed or canceled job. report: docs/api.md says what is in it.
+    points: of the input, points None until it has succeeded. attempts: how often a worker took it. position: jobs
+    before it while it is queued. error: of a failed or canceled job. report: docs/api.md says what is in it.
     """
 
     id: str

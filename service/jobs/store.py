@@ -211,13 +211,11 @@ class JobStore:
             return mine
 
     def note(
-        self, id: str, fence: int, kind: EventKind, data: dict[str, Any], *, progress: float | None = None,
-        points: int | None = None,
-    ) -> bool:  # fmt: skip
-        """Add an event of a running job, and what is known by then; False if the fence is old."""
+        self, id: str, fence: int, kind: EventKind, data: dict[str, Any], *, progress: float | None = None
+    ) -> bool:
+        """Add an event of a running job, and how far it is by then; False if the fence is old."""
         with self._transaction():
-            set_ = "progress = IFNULL(?, progress), points = IFNULL(?, points)"
-            mine = self._update(id, fence, set_, progress, points)
+            mine = self._update(id, fence, "progress = IFNULL(?, progress)", progress)
             if mine:
                 self._add_event(id, kind, data)
             return mine

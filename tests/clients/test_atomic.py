@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from straightpcf.clients.atomic import replaced_when_complete
+from straightpcf.clients.atomic import check_target, replaced_when_complete
 
 
 def write(path: Path, content: bytes) -> None:
@@ -59,3 +59,13 @@ def test_a_block_that_fails_changes_and_leaves_nothing(tmp_path: Path) -> None:
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(fifo := tmp_path / "fifo")  # as little a file as /dev/null
+    for path, said in ((fifo, "no file"), (tmp_path, "no file"), (tmp_path / "none" / "a.ply", "no folder")):
+        for act in (check_target, lambda path: write(path, b"new")):
+            with pytest.raises(OSError, match=said):
+                act(path)
+    assert fifo.is_fifo()
+    assert list(tmp_path.iterdir()) == [fifo]

@@ -69,6 +69,7 @@ def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: 
         (["denoise", "IN", "OUT.gif"], 3, "error [unknown_format]"),
         (["denoise", "missing.npy", "OUT.npy"], 3, "missing.npy"),
         (["denoise", "IN", "no/such/folder/OUT.npy"], 3, "no/such/folder"),
+        (["denoise", "IN", "."], 3, "is no file"),
         (["info", "missing.npy"], 3, "missing.npy"),
         (["frobnicate"], 2, "frobnicate"),
     ],

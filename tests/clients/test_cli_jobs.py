@@ -44,7 +44,11 @@ def test_submit_wait_status_result_jobs_cancel(server: RunningServer, scan: Path
     assert np.load(scan.with_name("clean.npy")).shape == (POINTS, 3)
     assert cli(server, "result", id, "-").stdout == scan.with_name("clean.npy").read_bytes()
     assert id in cli(server, "jobs").stdout.decode().splitlines()[0]
-    assert json.loads(cli(server, "jobs", "--json", "--limit", 1).stdout)[0]["id"] == id
+    long = "a" * 64  # the longest id there is
+    cli(server, "submit", scan, "--iterations", "1", "--id", long)
+    assert cli(server, "jobs").stdout.decode().split()[0] == long
+    assert cli(server, "wait", long).returncode == 0
+    assert json.loads(cli(server, "jobs", "--json", "--limit", 1).stdout)[0]["id"] == long
     assert cli(server, "cancel", id).stdout.decode() == f"{id} succeeded\n"
 
 
@@ -64,6 +68,9 @@ def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, t
     np.save(tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
     for arguments, code, text in (
         (("status", "no-such-job"), 3, "not_found"),
+        (("status", ""), 3, "not_found"),  # an unset $ID
+        (("result", "no-such-job", "/dev/null"), 3, "/dev/null"),
+        (("jobs", "--url", "http://127.0.0.1:80a0"), 3, "no address"),
         (("jobs", "--state", "gone"), 2, "invalid_options"),
         (("jobs", "--url", "ftp://x"), 2, "invalid_options"),
         (("denoise", tmp_path / "large.npy", tmp_path / "c.npy", "--url", server.url, "--device", "cpu"), 2, "device"),

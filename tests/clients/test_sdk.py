@@ -26,6 +26,7 @@ from straightpcf.points.errors import (
     InternalError,
     InvalidCloud,
     InvalidOptions,
+    InvalidRequest,
     ServerBusy,
     TooFewPoints,
     TooManyBytes,
@@ -233,6 +234,28 @@ def test_an_error_that_would_only_come_again_is_not_retried() -> None:
             with pytest.raises(kind):
                 client.health()
             assert len(heads) == 1
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://127.0.0.1:80a0", "http://256.1.1.1", "http://127.0.0.1:99999", "grpc://127.0.0.1:99999", "http://[::1"],
+)
+def test_a_url_that_cannot_be_is_refused_at_once(url: str) -> None:
+    with pytest.raises(InvalidRequest, match="is no address"):
+        Client(url)
+
+
+@pytest.mark.parametrize("key", ["", " secret", "secret "])
+def test_a_key_that_no_header_keeps_is_refused_at_once(key: str) -> None:
+    with pytest.raises(InvalidOptions, match="API key"):
+        Client("http://127.0.0.1:8000", api_key=key)
+
+
+def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
+    moved = canned("301 Moved Permanently", "", "Location: https://clouds.example/healthz")
+    refused = pytest.raises(InvalidRequest, match=r"https://clouds\.example/healthz")
+    with answering(moved) as (url, _), Client(url) as client, refused:
+        client.health()
 
 
 def test_delays_grow_stay_bounded_and_follow_the_server() -> None:

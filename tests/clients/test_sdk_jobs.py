@@ -337,3 +337,34 @@ def test_a_bad_id_and_a_missing_folder_are_refused(client: Client, tmp_path: Pat
         client.jobs.create(SMALL, id=".hidden")
     with pytest.raises(FileNotFoundError):
         client.denoise(SMALL, tmp_path / "nowhere" / "clean.npy")
+
+
+def test_events_behind_the_last_one_are_none(client: Client) -> None:
+    job = client.jobs.create(SMALL, iterations=1)
+    last = list(job.events())[-1]
+    assert isinstance(last, Completed)
+    assert list(job.events(after=last.id)) == []
+
+
+def test_the_async_client_hears_of_nothing_behind_the_last_event_too(url: str) -> None:
+    async def count() -> int:
+        async with AsyncClient(url) as client:
+            job = await client.jobs.create(SMALL, iterations=1)
+            last = [event async for event in job.events()][-1]
+            return len([event async for event in job.events(after=last.id)])
+
+    assert asyncio.run(count()) == 0
+
+
+def test_what_is_no_id_state_or_page_is_refused_alike_over_both_wires(client: Client, tmp_path: Path) -> None:
+    for id in ("", "..", "a/b", "a b"):  # "/jobs/" is the list and "/jobs/.." the page
+        with pytest.raises(NotFound, match="there is no job"):
+            client.jobs.get(id)
+    states: Any = ["done"]
+    with pytest.raises(InvalidRequest, match="state is 'done'"):
+        list(client.jobs.list(states=states))
+    for size in (0, 201):
+        with pytest.raises(InvalidRequest, match=f"page_size is {size}"):
+            list(client.jobs.list(page_size=size))
+    with pytest.raises(FileNotFoundError, match="is no file"):
+        client.jobs.create(tmp_path)

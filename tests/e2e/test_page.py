@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from straightpcf.points.formats import read_cloud
-from tests.clouds import noisy, torus
+from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
+from tests.waiting import wait_for
 
 POINTS = 2500
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -83,6 +84,26 @@ def test_a_broken_file_is_explained_and_the_page_goes_on(page: Any, scan: Path, 
     page.click("#submit")
     page.wait_for_selector("#report:not([hidden])")
     assert page.is_hidden("#error")
+
+
+def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
+    page: Any, scan: Path, tmp_path: Path
+) -> None:
+    np.save(large := tmp_path / "large.npy", noisy(sphere(40_000), 0.01))
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    page.click("#before")
+    wait_for(lambda: page.input_value("#blend") == "0")
+    page.set_input_files("#file", large)
+    page.click("#submit")
+    page.wait_for_selector("#status:has-text('Pass')")
+    assert page.input_value("#blend") == "1"
+    page.click("#cancel")
+    page.wait_for_selector("#cancel", state="hidden")
+    assert page.is_hidden("#error")
+    assert "canceled" in page.inner_text("#note")
 
 
 def _is_fault(said: Any) -> bool:

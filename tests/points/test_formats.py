@@ -151,6 +151,19 @@ def test_what_no_format_knows_is_refused_with_the_list(tmp_path: Path) -> None:
         format_named("gif")
 
 
+def test_a_suffix_that_the_bytes_belie_is_told_so(tmp_path: Path) -> None:
+    (path := tmp_path / "scan.ply").write_bytes(b"<html>")
+    with pytest.raises(UnknownFormat, match=r"scan\.ply begins with b'<html>'.* no ply file"):
+        read_cloud(path)
+
+
+def test_a_name_of_any_length_keeps_its_suffix(tmp_path: Path) -> None:
+    (path := tmp_path / "input").write_bytes(b"0 0 0\n")
+    assert read_cloud(path, name="long " * 40 + ".xyz")[1].name == "xyz"
+    with pytest.raises(UnknownFormat, match="needs a name with a suffix"):
+        read_cloud(path)
+
+
 def test_a_file_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         read_cloud(tmp_path / "none.ply")

@@ -61,6 +61,13 @@ def test_an_argument_wins_over_the_environment_and_none_does_not() -> None:
     assert (settings.port, settings.host) == (1, "::1")
 
 
+def test_a_blank_variable_is_a_setting_left_out_but_a_blank_key_file_opens_no_server() -> None:
+    blank = dict.fromkeys(("STRAIGHTPCF_HOST", "STRAIGHTPCF_PORT", "STRAIGHTPCF_DATA_DIR", "STRAIGHTPCF_THREADS"), " ")
+    assert Settings.from_environment(blank) == Settings()
+    with pytest.raises(InvalidOptions, match="api_keys_file"):
+        Settings.from_environment({"STRAIGHTPCF_API_KEYS_FILE": ""}).keys()
+
+
 def test_what_kubernetes_and_our_other_programs_are_told_is_no_setting() -> None:
     assert Settings.from_environment(KUBERNETES | OF_OTHERS) == Settings()
 
@@ -87,12 +94,16 @@ def test_a_key_that_no_header_can_carry_is_refused_under_its_settings_name(tmp_p
     assert Settings(api_keys_file=path).keys() == ("alpha",)
 
 
-def test_serve_ends_at_once_with_a_key_that_would_never_match(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "value"), [("API_KEYS", "clé"), ("WEIGHTS", "no/such/weights")])
+def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_weights(
+    name: str, value: str, tmp_path: Path
+) -> None:
     command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
-    environment = clean_environment() | {"STRAIGHTPCF_API_KEYS": "clé"}
+    environment = clean_environment() | {f"STRAIGHTPCF_{name}": value}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert "api_keys" in done.stderr
+    assert name.lower() in done.stderr
+    assert "Started server process" not in done.stderr
 
 
 def test_compose_lets_a_server_end_in_peace() -> None:
@@ -113,6 +124,10 @@ def test_compose_lets_a_server_end_in_peace() -> None:
         ("STRAIGHTPCF_PORT", "65536"),
         ("STRAIGHTPCF_MAX_JOBS", "0"),
         ("STRAIGHTPCF_TILE_POINTS", "9999"),
+        ("STRAIGHTPCF_RESULT_TTL_SECONDS", "inf"),
+        ("STRAIGHTPCF_RESULT_TTL_SECONDS", "nan"),
+        ("STRAIGHTPCF_ROW_TTL_SECONDS", "1e12"),
+        ("STRAIGHTPCF_MAX_SYNC_SECONDS", "inf"),
     ],
 )
 def test_unknown_names_and_impossible_values_are_refused(variable: str, value: str) -> None:

@@ -37,6 +37,29 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         assert "Traceback" not in server.log.read_text()
 
 
+def test_who_waits_in_vain_is_told_so_before_a_server_ends(tmp_path: Path) -> None:
+    np.save(long := tmp_path / "long.npy", noisy(torus(60_000), 0.01))
+    np.save(short := tmp_path / "short.npy", noisy(torus(400), 0.01))
+    with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "3"}) as server:
+        server.wait_until_ready()
+        subprocess.run(["curl", "-s", "-T", long, f"{server.url}/jobs/long?iterations=9"], check=True)
+        asked = ("denoise?iterations=1", "jobs/long?wait=60", "jobs/long/events", "jobs/long/stream")
+        bodies = (("-T", short), (), (), ())
+        curl = ("curl", "-s", "-N", "-o", "/dev/null", "-w", "%{http_code} %{exitcode}")
+        waiting = [
+            subprocess.Popen([*curl, *body, f"{server.url}/{path}"], stdout=subprocess.PIPE, text=True)
+            for path, body in zip(asked, bodies, strict=True)
+        ]
+        wait_for(lambda: len(list(server.data_dir.glob("jobs/*/input"))) == 2)
+        wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
+        time.sleep(0.5)  # for those that leave no trace
+        server.process.send_signal(signal.SIGTERM)
+        answers = [each.communicate(timeout=30)[0] for each in waiting]
+        assert answers == ["202 0", "503 0", "200 0", "200 0"]
+        server.process.wait(timeout=20)
+        assert "Traceback" not in server.log.read_text()
+
+
 def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(tmp_path: Path) -> None:
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(30_000), 0.01))
     with run_server(tmp_path) as server:

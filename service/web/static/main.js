@@ -24,6 +24,7 @@ parts.form.addEventListener("submit", (event) => {
 });
 parts.cancel.addEventListener("click", () => cancel().catch(showProblem));
 parts.key.addEventListener("change", () => {
+  parts.error.hidden = true; // it was of the key before
   keepApiKey(parts.key.value.trim());
   begin();
 });
@@ -118,9 +119,14 @@ async function follow(id, before, signal) {
     parts["report-title"].focus({ preventScroll: true });
   } else {
     parts.progress.hidden = true;
-    if (job.state === "canceled") speak("Canceled");
-    if (job.error) showProblem(new Problem({ ...job.error, requestId: "" }));
-    else stage.note(job.state === "canceled" ? "The job was canceled." : `The job is ${job.state}.`);
+    if (job.state === "canceled") {
+      speak("Canceled"); // wanted, and so no fault
+      stage.note("The job was canceled.");
+    } else if (job.error) {
+      showProblem(new Problem({ ...job.error, requestId: "" }));
+    } else {
+      stage.note(`The job is ${job.state}.`);
+    }
   }
 }
 

@@ -41,7 +41,6 @@ export class Stage {
     });
     this.viewer.setPointSize(Number(parts.size.value));
     this.viewer.setUp(parts.up.value);
-    this.blend(1);
     this.show(null);
   }
 
@@ -55,7 +54,11 @@ export class Stage {
       this.parts.size.value = Math.min(Math.max(size, SMALLEST), LARGEST);
       this.viewer.setPointSize(Number(this.parts.size.value));
     }
-    this.viewer?.show(cloud);
+    if (this.viewer) {
+      this.viewer.show(cloud);
+      cancelAnimationFrame(this.gliding);
+      this.blend(1); // who looked at the last cloud's "before" waits for this one's "after"
+    }
     this.note(note);
     this.update();
   }

@@ -1,0 +1,72 @@
+"""What a request may look like that brings a cloud, and what is said of one that may not."""
+
+from __future__ import annotations
+
+import io
+
+import httpx2
+import numpy as np
+import pytest
+
+from tests.clouds import noisy, torus
+from tests.conftest import RunningServer
+
+XYZ = noisy(torus(400), 0.01)
+
+
+def npy() -> bytes:
+    np.save(buffer := io.BytesIO(), XYZ)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT"])
+def test_a_slash_behind_denoise_is_no_other_place(server: RunningServer, method: str) -> None:
+    url = f"{server.url}/denoise/?iterations=1"  # `curl -T - URL/denoise/` sends this, and follows no redirect
+    answer = httpx2.request(method, url, content=iter([npy()]), timeout=60)
+    assert answer.status_code == 200, answer.text
+    assert np.load(io.BytesIO(answer.content)).shape == XYZ.shape
+
+
+@pytest.mark.parametrize(
+    ("query", "form"),
+    [
+        ("?iterations=1&iterations=2", {}),
+        ("?iterations=1", {"iterations": "2"}),
+        ("", {"iterations": ["1", "2"]}),
+    ],
+)
+@pytest.mark.parametrize("path", ["/denoise", "/jobs"])
+def test_an_option_that_is_said_twice_is_refused_by_name(
+    server: RunningServer, path: str, query: str, form: dict[str, str | list[str]]
+) -> None:
+    answer = httpx2.post(f"{server.url}{path}{query}", files={"file": ("a.npy", npy())}, data=form, timeout=60)
+    assert answer.json()["code"] == "invalid_options"
+    assert "'iterations'" in answer.json()["detail"]
+    assert not server.spooled_files()
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("iterations=two", "iterations is 'two'; it must be \"auto\" or 1..10"),
+        ("iterations=2.5", "iterations is '2.5'; it must be \"auto\" or 1..10"),
+        ("seed=1.5", "seed is '1.5'; it must be an integer in 0..4294967295"),
+        ("strength=0,5", "strength is '0,5'; it must be in 0..1"),
+    ],
+)
+def test_an_option_that_is_no_number_is_told_the_limit(server: RunningServer, query: str, said: str) -> None:
+    assert httpx2.post(f"{server.url}/jobs?{query}", content=npy()).json()["detail"] == said
+
+
+def test_a_packed_body_is_refused_and_not_taken_for_points(server: RunningServer) -> None:
+    url = f"{server.url}/denoise/frame.bin"
+    answer = httpx2.put(url, content=bytes(1600), headers={"Content-Encoding": "gzip"})
+    assert (answer.status_code, answer.json()["code"]) == (415, "unknown_format")
+    assert "gzip" in answer.json()["detail"]
+    assert httpx2.put(url, content=npy(), headers={"Content-Encoding": "identity"}, timeout=60).status_code == 200
+
+
+def test_text_without_a_name_is_told_to_bring_one(server: RunningServer) -> None:
+    answer = httpx2.post(f"{server.url}/denoise", content=b"0 0 0\n" * 50, timeout=60)
+    assert answer.json()["code"] == "unknown_format"
+    assert "it needs a name with a suffix" in answer.json()["detail"]
