@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
@@ -78,7 +79,9 @@ def load_state(
 
 
 def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
-    """Return the averaged network of a run's state and the run's progress."""
+    """Return the averaged network of a run's state, or that of shipped weights, and the run's progress."""
+    if "progress" not in _header(path):
+        return load_checkpoint(path), dict(read_checkpoint(path)[1].get("training", {}))
     tensors, metadata = _read(path)
     average = _under(tensors, "average.")
     couplings = len({name.split(".")[1] for name in average if name.startswith("velocity_modules.")})
@@ -106,11 +109,19 @@ def average_with(network: StraightPCF, path: Path) -> None:
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    metadata = _header(path)
+    if "progress" not in metadata:
+        raise MalformedFile(f"{path} is no training state: its header has no progress")
     with safe_open(path, framework="pt") as file:
-        metadata = file.metadata() or {}
-        if "progress" not in metadata:
-            raise MalformedFile(f"{path} is no training state: its header has no progress")
         return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
+
+
+def _header(path: Path) -> dict[str, str]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}
+    except (SafetensorError, ValueError) as exc:
+        raise MalformedFile(f"{path} is no safetensors file: {exc}") from exc
 
 
 def _under(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from straightpcf.model.checkpoint import load_checkpoint
+from straightpcf.model.filter import DEFAULT_WEIGHTS
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import Stage, TrainStep, train
 from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch, PatchSource
@@ -19,7 +21,7 @@ from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import average_with, read_network
 from straightpcf.model.train.team import Team
 from straightpcf.model.turns import turns
-from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 from tests.clouds import sphere, torus
 
 
@@ -331,6 +333,18 @@ def test_a_settled_run_keeps_the_statistics_and_can_start_from_its_own_stage(
     before, after = weights(velocity_run), weights(path)
     moved = {name.rsplit(".", 1)[1] for name in before if not torch.equal(before[name], after[name])}
     assert moved == {"weight", "bias"}
+
+
+def test_a_run_starts_from_weights_that_ship_and_takes_their_distance_module(data: Path, tmp_path: Path) -> None:
+    path = train("cvm", data=data, run_dir=tmp_path, iterations=2, batch_size=1, threads=1, init=DEFAULT_WEIGHTS,
+                 distance=DEFAULT_WEIGHTS, settled=True)  # fmt: skip
+    before, after = load_checkpoint(DEFAULT_WEIGHTS).state_dict(), weights(path)
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    assert moved
+    assert {name.split(".")[0] for name in moved} == {"velocity_modules"}
+    (broken := tmp_path / "broken.safetensors").write_bytes(b"no header")
+    with pytest.raises(MalformedFile, match="is no safetensors file"):
+        train("cvm", data=data, run_dir=tmp_path / "none", iterations=1, init=broken)
 
 
 def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: Path, velocity_run: Path) -> None:
