@@ -25,6 +25,15 @@ MAX_LINE_BYTES = 1 << 23
 _COMMENTS = (b"#", b"//")
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
+# Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
+_POSITIONS = (
+    AXES,
+    ("points:0", "points:1", "points:2"),
+    ("px", "py", "pz"),
+    ("pos_x", "pos_y", "pos_z"),
+    *(("easting", "northing", height) for height in ("elevation", "height", "altitude", "z")),
+)
+_UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _Offsets = npt.NDArray[np.int64]
 
@@ -62,8 +71,9 @@ class XyzSource:
 class Xyz(Format):
     """Read and write text tables of at least three columns between white space, commas or semicolons.
 
-    x, y, z are the first three columns, unless a line of names above the table says which they are. Comment lines
-    (`#`, `//`), blank lines, a line with the number of points and columns of any text are kept.
+    x, y, z are the columns that a line of names above the table says, and the first three where there is none; names
+    of more than three columns that say nothing of positions are refused. Comment lines (`#`, `//`), blank lines, a line
+    with the number of points and columns of any text are kept.
     """
 
     name = "xyz"
@@ -152,12 +162,26 @@ def _described(begin: int, line: int, declared: int | None, row: bytes, names: b
     axes = (0, 1, 2)
     for text in (names, remark):
         words = [word.strip(b"\"' ").decode("utf-8", "replace")[:80] for word in _words(text or b"")]
-        lower = [word.lower() for word in words]
-        is_title = len(words) == columns and len(set(words)) == columns and "" not in words
-        if is_title and all(lower.count(axis) == 1 for axis in AXES):
-            labels, axes = words, (lower.index("x"), lower.index("y"), lower.index("z"))
+        if len(words) != columns or len(set(words)) < columns or "" in words:
+            continue  # no title of this table
+        if found := _axes(words):
+            labels, axes = words, found
             break
+        if names and text is names and columns > 3:
+            known = "; ".join(", ".join(names) for names in _POSITIONS)
+            raise MalformedFile(
+                f"the names above line {line} do not say which columns are x, y, z: {shown(names)}; known are {known}"
+            )
     return Layout(begin, line, declared, _delimiter(row), tuple(labels), axes)
+
+
+def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return which of the columns so named are x, y and z, where each is named once."""
+    plain = [_UNIT.sub("", word.lower()) for word in words]
+    for x, y, z in _POSITIONS:
+        if plain.count(x) == plain.count(y) == plain.count(z) == 1:
+            return plain.index(x), plain.index(y), plain.index(z)
+    return None
 
 
 def _delimiter(row: bytes) -> bytes | None:

@@ -35,6 +35,11 @@ TABLES = {
     "comments, blanks": b"# a, b\n\n// 1\n1 2 3\n\n#9 9 9\n 4 5 6\n// end\n\n",
     "names": b"X Y Z\n1 2 3\n4 5 6\n",
     "names in another order": b"id,z,y,x\n7,3,2,1\n8,6,5,4\n",
+    "ParaView's names": b'"I","Points:0","Points:1","Points:2"\n7,1,2,3\n8,4,5,6\n',
+    "surveyors' names": b"id;Northing;Easting;Height\nA;2;1;3\nB;5;4;6\n",
+    "names with units": b"t [s],X [m],Y (m),Z [m]\n7,1,2,3\n8,4,5,6\n",
+    "three names of any kind": b"a,b,c\n1,2,3\n4,5,6\n",
+    "a remark of as many words": b"# made by a program\n1 2 3 7\n4 5 6 8\n",
     "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
     "count": b"2\n1 2 3 -100 255 255 255\n4 5 6 -100 0 0 0\n",
     "count under a comment": b"# pts\n 2 \n1 2 3\n4 5 6\n",
@@ -120,6 +125,10 @@ MALFORMED = {
     "prose": (b"hello world\n", r"line 1 has 2 columns"),
     "count too high": (b"3\n1 2 3\n4 5 6\n", r"declares 3 .* holds 2"),
     "count too low": (b"1\n1 2 3\n4 5 6\n", r"declares 1 .* holds 2"),
+    "names that name no position": (
+        b"id,lon,lat,h\n1,2,3,4\n",
+        r"names above line 2 .*id,lon,lat,h.*easting, northing",
+    ),
     "binary": (b"1 2 3\n\x00\x01\x02", r"0x00"),
     "UTF-16": ("1 2 3\n".encode("utf-16"), r"0x00"),
 }
