@@ -1,1 +1,1 @@
-"""Commands that print this project's figures: `quality`, `scans` and `speed`, each `python -m benchmarks.<name>`."""
+"""Commands that print this project's figures, each `python -m benchmarks.<name>`; what they said is in RESULTS.md."""

@@ -146,7 +146,9 @@ def _runner(options: argparse.Namespace) -> Run:
 def _ours(options: argparse.Namespace) -> Filter:
     if options.weights and _is_training_state(options.weights):
         network, _ = read_network(options.weights)
-        model = Filter(network, calibration=load_filter(device="cpu").calibration, threads=options.threads)
+        shipped = load_filter(device=options.device)
+        network.to(shipped.device)
+        model = Filter(network, calibration=shipped.calibration, device=shipped.device, threads=options.threads)
     else:
         model = load_filter(options.weights, device=options.device, threads=options.threads)
     model.euler_steps = options.euler_steps or model.euler_steps

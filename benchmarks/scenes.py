@@ -262,7 +262,10 @@ def distance_to(parts: list[Part], xyz: Floats) -> Floats:
 
 def main(arguments: list[str] | None = None) -> None:
     """Filter the scans and print what is left."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if unknown := set(options.scanners) - SCANNERS.keys():
+        parser.error(f"{min(unknown)!r} is no scanner; there are {', '.join(SCANNERS)}")
     denoiser = load_filter(options.weights, threads=options.threads)
     rows = []
     for name in options.scanners or SCANNERS:

@@ -70,7 +70,7 @@ def main() -> None:
     source = PatchSource.read(arguments.data / "punet_train.npz", validation=True)
     batch = source.draw(np.random.default_rng(1), arguments.patches)
     parts = batch.split(-(-arguments.patches // _AT_ONCE))
-    quarter = (4 * batch.time.flatten()).long()
+    quarter = (4 * batch.time.flatten()).floor().long()  # t < 0, before the first, counts in the means
     print(f"{'velocities':44} {'across, of each module (in quarters of t)':58} along   end, across")
     for name in arguments.states:
         modules: list[nn.Module]

@@ -69,7 +69,8 @@ class _Commands(TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     help="Clean noisy point clouds: the same points, in the same order, on the surface.",
-    epilog="Exit codes: 0 done, 2 usage, 3 refused, 4 device or package missing, 5 busy or unreachable, 70 internal.",
+    epilog="Exit codes: 0 done, 2 usage, 3 refused, 4 device or package missing, 5 busy or unreachable, 70 internal, "
+    "130 interrupted or canceled.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -101,7 +102,7 @@ def denoise(
     format: Format = None,
     name: Name = None,
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default one for each CPU.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
     api_key: Key = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
@@ -146,7 +147,7 @@ def watch(
     strength: Strength = 1.0,
     normals: Normals = "keep",
     device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default torch's own choice.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default one for each CPU.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
     api_key: Key = None,
 ) -> None:

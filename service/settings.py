@@ -1,4 +1,4 @@
-"""Read what an operator may set: the only place that looks at the environment."""
+"""Read what an operator may set: the only place of the server that looks at the environment."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Settings:
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
-    weights: None for the shipped ones.  threads: None for torch's own choice.
+    weights: None for the shipped ones.  threads: None for one for each CPU.
     tile_points: of a cloud, cut into patches at once; None for the filter's own default.
     shutdown_seconds: how long running requests may finish after SIGTERM.
     """

@@ -59,7 +59,7 @@ _SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
 OTHER_NOISE = 0.25
 HEAVY_TAILED, TAILS = 0.7, (0.6, 2.0)
 UNEQUAL, STRETCH = 0.4, 0.4
-# Their noise, in radii of the cloud's bounding sphere.
+# The noise of clouds that first passes see, in radii of the bounding sphere.
 FIRST_NOISE = 0.03 * (np.arange(60) + 0.5) / 60
 _RADII = 200  # patches of a cloud that are measured
 # Every tenth shape by name stays out of training, so that there is something honest to choose by.

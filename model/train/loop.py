@@ -74,14 +74,15 @@ def train(
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
     data: the archives of clean clouds (`PatchSource.read`), which a run that goes on may change.
-    init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage.
-    distance: a state whose DistanceModule to start from instead. rows: points of a patch in the loss. settled: without
-    dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The learning rate warms
-    up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state saved, to go on
-    another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each batch, one thread
-    each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on (`coupled_loss`).
-    Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed and
-    thread count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
+    init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage, or
+    weights that ship. distance: one of these whose DistanceModule to start from instead. rows: points of a patch in the
+    loss. settled: without dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The
+    learning rate warms up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state
+    saved, to go on another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each
+    batch, one thread each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on
+    (`coupled_loss`).
+    Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed, thread
+    and process count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
     missing or unfit.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):

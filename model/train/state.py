@@ -91,7 +91,7 @@ def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
 
 
 def take_distance_module(network: StraightPCF, path: Path) -> None:
-    """Give a network the averaged DistanceModule of a run's state."""
+    """Give a network the averaged DistanceModule of a run's state, or that of shipped weights."""
     network.distance_module.load_state_dict(read_network(path)[0].distance_module.state_dict())
 
 
