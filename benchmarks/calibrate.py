@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
-from straightpcf.model.checkpoint import save_checkpoint
+from straightpcf.model.calibration import Calibration
+from straightpcf.model.checkpoint import read_checkpoint, save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
@@ -38,6 +39,7 @@ def main() -> None:
     parser.add_argument(
         "--mean", type=Path, help="a state trained on from this one: take the mean of both's velocities"
     )
+    parser.add_argument("--table", type=Path, help="weights whose table of noise to keep, instead of reading a new one")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
@@ -60,7 +62,10 @@ def main() -> None:
         every = [f"{shape}/10000" for shape in shapes] + [f"{shape}/50000" for shape in shapes[3::8]]
         clouds = _read(archive, arguments.clouds or every)
     model = Filter(network, threads=arguments.threads)
-    model.calibration = noise_table(model, dense)
+    if arguments.table is None:
+        model.calibration = noise_table(model, dense)
+    else:
+        model.calibration = Calibration.from_metadata(read_checkpoint(arguments.table)[1])
     traces = _traces(model, clouds, arguments.noise_type, arguments.noise, arguments.traces)
     calibration = calibrate(traces, model.calibration)
     columns = f"{'d before each pass':32} {'CD x1e4 after 0, 1, ...':42}"
