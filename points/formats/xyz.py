@@ -162,10 +162,11 @@ def _described(begin: int, line: int, declared: int | None, row: bytes, names: b
     axes = (0, 1, 2)
     for text in (names, remark):
         words = [word.strip(b"\"' ").decode("utf-8", "replace")[:80] for word in _words(text or b"")]
-        if len(words) != columns or len(set(words)) < columns or "" in words:
+        if len(words) != columns:
             continue  # no title of this table
         if found := _axes(words):
-            labels, axes = words, found
+            axes = found
+            labels = [words[i] if words.count(words[i]) == 1 and words[i] else labels[i] for i in range(columns)]
             break
         if names and text is names and columns > 3:
             known = "; ".join(", ".join(names) for names in _POSITIONS)

@@ -38,6 +38,7 @@ TABLES = {
     "ParaView's names": b'"I","Points:0","Points:1","Points:2"\n7,1,2,3\n8,4,5,6\n',
     "surveyors' names": b"id;Northing;Easting;Height\nA;2;1;3\nB;5;4;6\n",
     "names with units": b"t [s],X [m],Y (m),Z [m]\n7,1,2,3\n8,4,5,6\n",
+    "names with gaps and twins": b"id,x,y,z,w,w,\n7,1,2,3,8,9,\n7,4,5,6,8,9,\n",
     "three names of any kind": b"a,b,c\n1,2,3\n4,5,6\n",
     "a remark of as many words": b"# made by a program\n1 2 3 7\n4 5 6 8\n",
     "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
