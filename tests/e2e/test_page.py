@@ -13,6 +13,7 @@ import pytest
 from straightpcf.points.formats import read_cloud
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
+from tests.points.test_xyz import TABLES
 from tests.waiting import wait_for
 
 POINTS = 2500
@@ -104,6 +105,12 @@ def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     page.wait_for_selector("#cancel", state="hidden")
     assert page.is_hidden("#error")
     assert "canceled" in page.inner_text("#note")
+
+
+def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
+    read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
+    for case, raw in TABLES.items():
+        assert page.evaluate(read, list(raw)) == [1, 2, 3, 4, 5, 6], case
 
 
 def _is_fault(said: Any) -> bool:

@@ -2,6 +2,15 @@
 
 import { Rows, eachLine, isSpace, readColumns } from "./lines.js";
 
+const POSITIONS = [
+  ["x", "y", "z"],
+  ["points:0", "points:1", "points:2"],
+  ["px", "py", "pz"],
+  ["pos_x", "pos_y", "pos_z"],
+  ...["elevation", "height", "altitude", "z"].map((height) => ["easting", "northing", height]),
+];
+const UNIT = /\s*(\[.*\]|\(.*\))$/;
+
 export function readXyz(bytes) {
   const rows = new Rows();
   let table = null;
@@ -32,9 +41,12 @@ function layout(line, names, remark) {
   const columns = words(line).length;
   const delimiter = line.includes(";") ? 59 : line.includes(",") ? 44 : 0;
   for (const title of [names, remark]) {
-    const labels = words(title).map((word) => word.replace(/^["' ]+|["' ]+$/g, "").toLowerCase());
-    const axes = ["x", "y", "z"].map((axis) => labels.indexOf(axis));
-    if (labels.length === columns && axes.every((axis) => axis >= 0)) return { delimiter, axes };
+    const labels = words(title).map((word) => word.replace(/^["' ]+|["' ]+$/g, "").toLowerCase().replace(UNIT, ""));
+    if (labels.length !== columns) continue;
+    for (const names of POSITIONS) {
+      const axes = names.map((name) => labels.indexOf(name));
+      if (axes.every((axis) => axis >= 0)) return { delimiter, axes };
+    }
   }
   return { delimiter, axes: [0, 1, 2] };
 }
