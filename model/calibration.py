@@ -27,8 +27,8 @@ class Calibration:
     pull their sides together.
     crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
     dense points the second leaves more than of few.
-    stuck: where d after the first pass is more than this share of d at the start, and that was below _PLAIN, walls
-    close together were read, not noise: further passes would join them.
+    stuck: where a second pass is due, but d after the first is more than this share of d at the start, and that was
+    below _PLAIN, walls close together were read, not noise: further passes would join them.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
@@ -75,9 +75,9 @@ class Calibration:
         distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`.
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
-        if done == 1 and start < _PLAIN and now > self.stuck * start:
-            return 0
         due = 1 + sum(start > limit for limit in self.starts)
+        if done == 1 < due and start < _PLAIN and now > self.stuck * start:
+            return 0
         polished = 1 + sum(start > limit for limit in self.polish)
         if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:
             polished = 3

@@ -92,7 +92,7 @@ class DenoiseServiceServicer:
 
     def Denoise(self, request_iterator, context):
         """Denoise one cloud: a config, then the file in chunks; patches or progress come back while it is worked on.
-        The job lives as long as the call, unless an `idempotency-key` names it.
+        The job lives as long as the call, unless `job.id` or an `idempotency-key` names it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

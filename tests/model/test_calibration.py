@@ -52,7 +52,9 @@ def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> 
 
 
 def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
-    assert passes(Calibration(), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 1
+    assert passes(Calibration(starts=(0.45,)), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 1
+    nearly_clean = Calibration(starts=(0.45,), polish=(0.22,), settled=(0.18,))  # d of clean clouds is 0.12
+    assert passes(nearly_clean, trace(0.0, 0.223, 0.16, 0.15)) == 2
     assert passes(Calibration(stuck=1.0, starts=(0.45,)), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 2
     assert passes(Calibration(), trace(0.0, 0.90, 0.80, 0.40, 0.20)) > 1  # so much noise that a pass hardly shows
 
