@@ -19,7 +19,7 @@ from straightpcf.points.errors import InvalidCloud, InvalidRequest, NotFound
 from straightpcf.points.formats import format_for, format_named, recognised
 from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE, STATES
+from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE, MAX_PAGE_SIZE, STATES
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 
 __all__ = [
@@ -40,7 +40,6 @@ __all__ = [
 ]
 
 CHUNK_BYTES = 2**18
-MAX_PAGE_SIZE = 200
 STREAM_SECONDS = 60.0  # a stream is silent while its job waits; of events something comes every 15
 
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.

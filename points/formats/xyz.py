@@ -169,7 +169,7 @@ def _described(begin: int, line: int, declared: int | None, row: bytes, names: b
             labels = [words[i] if words.count(words[i]) == 1 and words[i] else labels[i] for i in range(columns)]
             break
         if names and text is names and columns > 3:
-            known = "; ".join(", ".join(names) for names in _POSITIONS)
+            known = "; ".join(", ".join(three) for three in _POSITIONS)
             raise MalformedFile(
                 f"the names above line {line} do not say which columns are x, y, z: {shown(names)}; known are {known}"
             )

@@ -19,6 +19,7 @@ from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire import straightpcf_pb2_grpc as stubs
+from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.points.wire.messages import (
     MAX_MESSAGE_BYTES,
     event_message,
@@ -174,8 +175,8 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     ) -> pb.ListJobsResponse:
         """Show a page of jobs."""
         async with self._answering(context, "ListJobs") as caller:
-            if request.limit > 200:
-                raise InvalidRequest(f"limit is {request.limit}; it must be in 1..200")
+            if request.limit > MAX_PAGE_SIZE:
+                raise InvalidRequest(f"limit is {request.limit}; it must be in 1..{MAX_PAGE_SIZE}")
             records, cursor = await self._engine.list(
                 owner=caller.owner,
                 states=[_state(state) for state in request.states],

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
 from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
@@ -64,7 +65,7 @@ async def list_jobs(
     request: Request,
     owner: Owner,
     state: Annotated[list[JobState] | None, Query(description="Only these; may be repeated.")] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE)] = 50,
     cursor: Annotated[str | None, Query(description="The next_cursor of the page before.")] = None,
 ) -> JobPage:
     """Show this key's jobs, newest first."""
