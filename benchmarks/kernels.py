@@ -44,7 +44,7 @@ def main() -> None:
     keep_large_buffers()
     torch.set_default_device(device)
     generator = torch.Generator(device).manual_seed(0)
-    where = torch.cuda.get_device_name(device) if device != "cpu" else f"{cpu.instruction_set()}, 1 thread"
+    where = torch.cuda.get_device_name(device) if device != "cpu" else f"{cpu.instruction_sets()[0]}, 1 thread"
     print(f"{where}, {POINTS} points, k = {NEIGHBOURS}, ms per patch")
     print(f"{'':24} {'kernel':>8} {'torch':>8} {'GFLOP/s':>8}")
     for dims in (3, 32, 64):

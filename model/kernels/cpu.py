@@ -20,15 +20,19 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["EdgeMax", "build", "build_all", "instruction_set", "knn", "load"]
+__all__ = ["EdgeMax", "build", "build_all", "instruction_sets", "knn", "load"]
 
-_SOURCE = Path(__file__).with_name("edgeconv.cpp")
+_SOURCES = tuple(sorted(Path(__file__).parent.glob("*.cpp")))
+_HEADERS = tuple(sorted(Path(__file__).parent.glob("*.h")))
 _SHIPPED = Path(__file__).with_name("lib")
+_AVX2 = "-mavx2 -mfma -mbmi -mbmi2"
+_AVX512 = f"-mavx512f -mavx512bw -mavx512dq -mavx512vl {_AVX2}"
 # Of x86, newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
 _INSTRUCTION_SETS = {
-    "avx512_bf16": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx512bf16 -mavx2 -mfma -mbmi -mbmi2",
-    "avx512bw": "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mavx2 -mfma -mbmi -mbmi2",
-    "avx2": "-mavx2 -mfma -mbmi -mbmi2",
+    "amx_bf16": f"-mamx-tile -mamx-bf16 -mavx512bf16 {_AVX512}",
+    "avx512_bf16": f"-mavx512bf16 {_AVX512}",
+    "avx512bw": _AVX512,
+    "avx2": _AVX2,
     "generic": "",
 }
 # Sums may be reordered. Not -ffast-math: it lets the compiler drop the comparisons that the selection relies on, and
@@ -39,15 +43,23 @@ _BUILD_SECONDS = 120
 
 
 @functools.cache
-def instruction_set() -> str:
-    """Name the newest instruction set this processor has among those the kernels are compiled for."""
+def instruction_sets() -> tuple[str, ...]:
+    """Name the instruction sets this processor has among those the kernels are compiled for, newest first."""
     if not _is_x86():  # under emulation /proc/cpuinfo may be the host's
-        return "generic"
+        return ("generic",)
     try:
         listed = set(Path("/proc/cpuinfo").read_text().split())
     except OSError:
-        return "generic"
-    return next(name for name in _INSTRUCTION_SETS if name in listed or name == "generic")
+        return ("generic",)
+    if not (listed >= {"amx_tile", "avx512_bf16"} and _tiles_granted()):
+        listed.discard("amx_bf16")
+    return tuple(name for name in _INSTRUCTION_SETS if name in listed or name == "generic")
+
+
+def _tiles_granted() -> bool:
+    """Ask Linux for AMX's tile registers, which a process must before it uses them (Documentation/arch/x86/xstate)."""
+    arch_prctl, request_permission, tile_data = 158, 0x1023, 18
+    return bool(ctypes.CDLL(None).syscall(arch_prctl, request_permission, tile_data) == 0)
 
 
 @functools.cache
@@ -55,23 +67,25 @@ def load() -> ctypes.CDLL | None:
     """Return the library for this processor, compiled if need be, or None where that is not possible."""
     if os.environ.get("STRAIGHTPCF_NO_KERNELS"):  # the one switch: compare with the torch twins
         return None
-    for folder in (_SHIPPED, _cache()):
-        path = folder / _file_name()
-        if path.is_file():
-            return _open(path)
-    try:
-        return _open(build(_cache()))
-    except (OSError, subprocess.SubprocessError) as exc:
-        warnings.warn(f"CPU kernels not compiled ({exc}); plain torch is used, several times slower", stacklevel=2)
-        return None
+    failed: Exception | None = None
+    for name in instruction_sets():  # a compiler may be older than the processor
+        for folder in (_SHIPPED, _cache()):
+            path = folder / _file_name(name)
+            if path.is_file():
+                return _open(path)
+        try:
+            return _open(build(_cache(), name))
+        except (OSError, subprocess.SubprocessError) as exc:
+            failed = failed or exc
+    warnings.warn(f"CPU kernels not compiled ({failed}); plain torch is used, several times slower", stacklevel=2)
+    return None
 
 
-def build(folder: Path, target_set: str | None = None) -> Path:
-    """Compile for an instruction set (this processor's by default) into `folder`.
+def build(folder: Path, target_set: str) -> Path:
+    """Compile for an instruction set into `folder`.
 
     Raises OSError or SubprocessError where that fails.
     """
-    target_set = target_set or instruction_set()
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         raise OSError("no C++ compiler: install g++")
@@ -80,7 +94,7 @@ def build(folder: Path, target_set: str | None = None) -> Path:
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         built = Path(scratch) / "kernel.so"
         flags = [*_FLAGS.split(), *_INSTRUCTION_SETS[target_set].split()]
-        command = [compiler, *flags, str(_SOURCE), "-o", str(built)]
+        command = [compiler, *flags, *map(str, _SOURCES), "-o", str(built)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_SECONDS, check=False)
         if done.returncode != 0:
             raise OSError(f"{compiler} failed: {done.stderr.strip()[:500]}")
@@ -102,9 +116,10 @@ def _is_x86() -> bool:
     return platform.machine() in ("x86_64", "AMD64")
 
 
-def _file_name(target_set: str | None = None) -> str:
-    digest = hashlib.sha256(_SOURCE.read_bytes() + _FLAGS.encode()).hexdigest()[:12]
-    return f"edgeconv-{platform.machine()}-{target_set or instruction_set()}-{digest}.so"
+def _file_name(target_set: str) -> str:
+    read = b"".join(path.read_bytes() for path in _SOURCES + _HEADERS)
+    digest = hashlib.sha256(read + _FLAGS.encode()).hexdigest()[:12]
+    return f"kernels-{platform.machine()}-{target_set}-{digest}.so"
 
 
 def _open(path: Path) -> ctypes.CDLL:
@@ -161,7 +176,7 @@ class EdgeMax(torch.autograd.Function):
         grad_a, grad_b, grad_weight = torch.empty_like(a), torch.zeros_like(b), torch.zeros_like(weight)
         for i in range(batch):
             ctx.library.straightpcf_edge_max_backward(
-                _at(grad[i]), _at(arg[i]), _at(a[i]), _at(b[i]), _at(index[i]), _at(weight), rows, index.shape[2],
-                width, weight.shape[0], _at(grad_a[i]), _at(grad_b[i]), _at(grad_weight),
+                _at(grad[i]), _at(arg[i]), _at(a[i]), _at(b[i]), _at(index[i]), _at(weight), rows, b.shape[1],
+                index.shape[2], width, weight.shape[0], _at(grad_a[i]), _at(grad_b[i]), _at(grad_weight),
             )  # fmt: skip
         return None, grad_a, grad_b, None, grad_weight, None

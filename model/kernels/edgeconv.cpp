@@ -1,201 +1,13 @@
-// The two loops the filter spends its time in, for one CPU thread: k nearest neighbours inside a patch,
-// and the EdgeConv maximum with its gradient. Python calls them through ctypes (cpu.py), which releases
-// the GIL, so callers run one patch per thread. Every function has a plain torch twin in model/ops.py.
+// The EdgeConv maximum and its gradient, for one CPU thread. Python calls them through ctypes (cpu.py), which
+// releases the GIL, so callers run one patch per thread. Every function has a plain torch twin in model/ops.py.
 //
-// Compiled once per instruction set. Vectors are 16 floats; the compiler splits them where registers are
-// narrower. With AVX512-BF16 the products are bfloat16 with float32 sums, otherwise float32 throughout.
+// Compiled once per instruction set, with knn.cpp. With AVX512-BF16 the products are bfloat16 with float32 sums,
+// and on AMX's tiles where there are any; otherwise float32 throughout.
 
-#include <algorithm>
-#include <cstdint>
-#include <cstring>
-#include <vector>
-#if defined(__AVX512F__)
-#include <immintrin.h>
-#endif
-
-namespace {
-
-constexpr int LANES = 16;
-typedef float vec __attribute__((vector_size(64), aligned(4)));
-typedef int32_t ivec __attribute__((vector_size(64), aligned(4)));
-
-inline vec load(const float* p) { vec v; std::memcpy(&v, p, sizeof v); return v; }
-inline void store(float* p, vec v) { std::memcpy(p, &v, sizeof v); }
-inline vec splat(float x) { return vec{} + x; }
-
-constexpr float FAR = 3.4e38f;  // of padding and of the query itself: never chosen
-constexpr int QUERIES = 8;
-
-// Squared distances of QUERIES queries to all points; `columns` is the patch transposed, (dims, padded).
-inline void distances(const float* columns, int padded, const float* queries, int dims, float* out) {
-  for (int j = 0; j < padded; j += 2 * LANES) {
-    vec sum[QUERIES][2];
-    for (int q = 0; q < QUERIES; ++q) sum[q][0] = sum[q][1] = vec{};
-    for (int d = 0; d < dims; ++d) {
-      const vec c0 = load(columns + (size_t)d * padded + j), c1 = load(columns + (size_t)d * padded + j + LANES);
-      for (int q = 0; q < QUERIES; ++q) {
-        const vec x = splat(queries[(size_t)q * dims + d]);
-        const vec e0 = c0 - x, e1 = c1 - x;
-        sum[q][0] += e0 * e0;
-        sum[q][1] += e1 * e1;
-      }
-    }
-    for (int q = 0; q < QUERIES; ++q) {
-      store(out + (size_t)q * padded + j, sum[q][0]);
-      store(out + (size_t)q * padded + j + LANES, sum[q][1]);
-    }
-  }
-}
-
-// What `select` needs beside its arguments: the candidates of one query, a vector longer than a patch.
-struct Candidates {
-  std::vector<float> distance;
-  std::vector<int32_t> index;
-  std::vector<uint64_t> keys;
-  explicit Candidates(int padded) : distance(padded + LANES), index(padded + LANES), keys(padded) {}
-};
-
-#if defined(__AVX512F__)
-
-// How many of `count` vectors' floats are at most the one whose bits are `bits`; floats >= 0 order as their bits do.
-inline int at_most(const float* values, int count, int32_t bits) {
-  const __m512i limit = _mm512_set1_epi32(bits);
-  int found = 0;
-  for (int n = 0; n < count; ++n)
-    found += __builtin_popcount(_mm512_cmple_epi32_mask(_mm512_loadu_si512(values + n * LANES), limit));
-  return found;
-}
-
-// Indices of the k smallest distances (ties go to the lower index), in no particular order.
-// The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates;
-// both thresholds are found by bisection over the bits, which no branch predictor can get wrong.
-inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
-  int32_t bound;
-  std::memcpy(&bound, &FAR, 4);
-  if (k <= 4 * LANES) {
-    float least[4 * LANES];
-    for (int g = 0; g < 4; ++g) {
-      __m512 m = _mm512_loadu_ps(distance + g * LANES);
-      for (int j = (g + 4) * LANES; j < padded; j += 4 * LANES) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
-      _mm512_storeu_ps(least + g * LANES, m);
-    }
-    int32_t low = -1;
-    for (int tries = 0; tries < 18; ++tries) {  // any bound that k of them reach will do
-      const int32_t middle = low + (bound - low) / 2;
-      const int found = at_most(least, 4, middle);
-      (found >= k ? bound : low) = middle;
-      if (found == k) break;
-    }
-  }
-  const __m512i limit = _mm512_set1_epi32(bound), far = _mm512_castps_si512(_mm512_set1_ps(FAR));
-  const __m512i step = _mm512_set1_epi32(LANES);
-  __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  int count = 0;
-  for (int j = 0; j < padded; j += LANES, index = _mm512_add_epi32(index, step)) {
-    const __m512i d = _mm512_loadu_si512(distance + j);
-    const __mmask16 chosen = _mm512_cmple_epi32_mask(d, limit) & _mm512_cmplt_epi32_mask(d, far);
-    _mm512_storeu_si512(&near.distance[count], _mm512_maskz_compress_epi32(chosen, d));
-    _mm512_storeu_si512(&near.index[count], _mm512_maskz_compress_epi32(chosen, index));
-    count += __builtin_popcount(chosen);
-  }
-  if (count <= k) {  // fewer points than neighbours: in order, then the farthest again
-    for (int n = 0; n < count; ++n) {
-      uint32_t bits;
-      std::memcpy(&bits, &near.distance[n], 4);
-      near.keys[n] = (uint64_t(bits) << 32) | uint32_t(near.index[n]);
-    }
-    std::sort(near.keys.begin(), near.keys.begin() + count);
-    for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
-    return;
-  }
-  _mm512_storeu_si512(&near.distance[count], far);
-  const int vectors = (count + LANES - 1) / LANES;
-  int32_t low = -1, high = bound;
-  int reached = count;
-  while (reached != k && high - low > 1) {
-    const int32_t middle = low + (high - low) / 2;
-    const int found = at_most(near.distance.data(), vectors, middle);
-    if (found >= k) {
-      high = middle;
-      reached = found;
-    } else {
-      low = middle;
-    }
-  }
-  const int32_t sure = reached == k ? high : low;  // else some lie exactly at `high`, and not all of them fit
-  int taken = 0;
-  for (int n = 0; n < count; ++n) {
-    int32_t bits;
-    std::memcpy(&bits, &near.distance[n], 4);
-    out[taken] = near.index[n];
-    taken += bits <= sure && taken < k;
-    if (taken == k) return;
-  }
-  for (int n = 0; taken < k; ++n) {
-    int32_t bits;
-    std::memcpy(&bits, &near.distance[n], 4);
-    if (bits == high) out[taken++] = near.index[n];
-  }
-}
-
-#else
-
-// Indices of the k smallest distances (ties go to the lower index), in no particular order.
-// The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few keys.
-inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
-  float bound = FAR;
-  if (k <= 4 * LANES) {
-    float least[4 * LANES];
-    for (int g = 0; g < 4; ++g) {
-      vec m = load(distance + g * LANES);
-      for (int j = g * LANES + 4 * LANES; j < padded; j += 4 * LANES) {
-        const vec d = load(distance + j);
-        m = d < m ? d : m;
-      }
-      store(least + g * LANES, m);
-    }
-    std::nth_element(least, least + k - 1, least + 4 * LANES);
-    bound = least[k - 1];
-  }
-  int count = 0;
-  for (int j = 0; j < padded; ++j)
-    if (distance[j] <= bound && distance[j] < FAR) {
-      uint32_t bits;
-      std::memcpy(&bits, &distance[j], 4);
-      near.keys[count++] = (uint64_t(bits) << 32) | uint32_t(j);
-    }
-  const auto begin = near.keys.begin();
-  if (count > k) std::nth_element(begin, begin + k, begin + count);
-  else std::sort(begin, begin + count);
-  for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
-}
-
-#endif
-
-}  // namespace
+#include "tiles.h"
+#include "vectors.h"
 
 extern "C" {
-
-// points (count, dims), count > 1; queries are the first `rows` of them; out (rows, k) indices, self left out.
-void straightpcf_knn(const float* points, int count, int dims, int rows, int k, int32_t* out) {
-  const int padded = (count + 63) / 64 * 64;
-  std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)QUERIES * padded);
-  std::vector<float> queries((size_t)QUERIES * dims);
-  Candidates near(padded);
-  for (int i = 0; i < count; ++i)
-    for (int d = 0; d < dims; ++d) columns[(size_t)d * padded + i] = points[(size_t)i * dims + d];
-  for (int first = 0; first < rows; first += QUERIES) {
-    const int block = std::min(QUERIES, rows - first);
-    std::memcpy(queries.data(), points + (size_t)first * dims, (size_t)block * dims * sizeof(float));
-    distances(columns.data(), padded, queries.data(), dims, distance.data());
-    for (int q = 0; q < block; ++q) {
-      float* row = &distance[(size_t)q * padded];
-      std::fill(row + count, row + padded, FAR);
-      row[first + q] = FAR;
-      select(row, padded, k, near, out + (size_t)(first + q) * k);
-    }
-  }
-}
 
 // W (out_width, width) -> packed for edge_max. Size: width * out_width floats (bf16 uses half of it).
 void straightpcf_pack(const float* weight, int width, int out_width, float* packed) {
@@ -283,6 +95,72 @@ inline void hidden_rows(const float* a, const float* b, const int32_t* index, in
   }
 }
 
+#if defined(__AMX_BF16__)
+
+// relu(a_i + b_j) as tiles: 16 edges by 32 channels each, the tiles of 32 edges beside each other.
+inline void hidden_tiles(const float* a, const float* b, const int32_t* index, int k, int edges, int width,
+                         uint16_t* out) {
+  for (int n = 0; n < edges; ++n) {
+    const float* row = b + (size_t)index[n < k ? n : 0] * width;  // filled up with the first: a maximum stays
+    uint16_t* place = out + (size_t)(n / (2 * TILE)) * 2 * TILE * width + (n % (2 * TILE)) * DEPTH;
+    for (int d = 0; d < width; d += DEPTH, place += 2 * TILE * DEPTH) {
+      const __m512 zero = _mm512_setzero_ps();
+      const __m512 low = _mm512_max_ps(_mm512_add_ps(_mm512_loadu_ps(a + d), _mm512_loadu_ps(row + d)), zero);
+      const __m512 high =
+          _mm512_max_ps(_mm512_add_ps(_mm512_loadu_ps(a + d + LANES), _mm512_loadu_ps(row + d + LANES)), zero);
+      _mm512_storeu_si512(place, (__m512i)_mm512_cvtne2ps_pbh(high, low));
+    }
+  }
+}
+
+// The largest of `edges` rows of 32 channels that start at `sums`, and which row; `first` is added to it.
+inline void largest(const float* sums, int first, vec best[2], ivec which[2], bool want) {
+  for (int n = 0; n < 2 * TILE; ++n)
+    for (int c = 0; c < 2; ++c) {
+      const vec s = load(sums + (size_t)n * 2 * LANES + c * LANES);
+      if (want) which[c] = s > best[c] ? (ivec{} + (first + n)) : which[c];
+      best[c] = s > best[c] ? s : best[c];
+    }
+}
+
+void edge_max_tiles(const float* a, const float* b, const int32_t* index, const float* packed, int rows, int k,
+                    int width, int out_width, float* out, uint8_t* arg) {
+  const int edges = (k + 2 * TILE - 1) / (2 * TILE) * 2 * TILE;
+  std::vector<uint16_t> scratch((size_t)edges * width + DEPTH);
+  uint16_t* hidden = reinterpret_cast<uint16_t*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) / 64 * 64);
+  alignas(64) float sums[2 * TILE * 2 * LANES];
+  const uint16_t* weight = reinterpret_cast<const uint16_t*>(packed);
+  configure_tiles();
+  for (int i = 0; i < rows; ++i) {
+    hidden_tiles(a + (size_t)i * width, b, index + (size_t)i * k, k, edges, width, hidden);
+    for (int c0 = 0; c0 < out_width; c0 += 2 * LANES) {
+      vec best[2] = {splat(-3.4e38f), splat(-3.4e38f)};
+      ivec which[2] = {};
+      for (int first = 0; first < edges; first += 2 * TILE) {
+        const uint16_t* h = hidden + (size_t)first * width;
+        const uint16_t* w = weight + (size_t)c0 * width;
+        clear_sums();
+        for (int d = 0; d < width; d += DEPTH, h += 2 * TILE * DEPTH, w += DEPTH * LANES) {
+          load_rows(h, TILE * DEPTH);
+          load_columns(w, (size_t)LANES * width);
+          multiply();
+        }
+        store_sums(sums, 2 * LANES);
+        largest(sums, first, best, which, arg != nullptr);
+      }
+      for (int c = 0; c < 2; ++c) {
+        store(out + (size_t)i * out_width + c0 + c * LANES, best[c]);
+        if (arg)
+          for (int lane = 0; lane < LANES; ++lane)
+            arg[(size_t)i * out_width + c0 + c * LANES + lane] = uint8_t(which[c][lane]);
+      }
+    }
+  }
+  _tile_release();
+}
+
+#endif
+
 template <int COLS>
 void edge_max(const float* a, const float* b, const int32_t* index, const float* packed, int rows, int k, int width,
               int out_width, float* out, uint8_t* arg) {
@@ -320,50 +198,58 @@ extern "C" {
 // out[i, c] = max_n sum_d relu(a[i, d] + b[index[i, n], d]) W[c, d]; arg (rows, out_width) says which n, may be null.
 void straightpcf_edge_max(const float* a, const float* b, const int32_t* index, const float* packed, int rows, int k,
                           int width, int out_width, float* out, uint8_t* arg) {
+#if defined(__AMX_BF16__)
+  if (width % DEPTH == 0 && out_width % (2 * LANES) == 0)
+    return edge_max_tiles(a, b, index, packed, rows, k, width, out_width, out, arg);
+#endif
   if (out_width % (2 * LANES) == 0)
     edge_max<2>(a, b, index, packed, rows, k, width, out_width, out, arg);
   else
     edge_max<1>(a, b, index, packed, rows, k, width, out_width, out, arg);
 }
 
-// The gradient: only the winning edge of each (i, c) carries any. grad_b and grad_weight are added to.
+// The gradient: only the winning edge of each (i, c) carries any. grad_b (count, width) and grad_weight are added to.
+// Sixteen hidden channels at a time: their share of all that is read in random order fits the caches.
 void straightpcf_edge_max_backward(const float* grad, const uint8_t* arg, const float* a, const float* b,
-                                   const int32_t* index, const float* weight, int rows, int k, int width,
+                                   const int32_t* index, const float* weight, int rows, int count, int k, int width,
                                    int out_width, float* grad_a, float* grad_b, float* grad_weight) {
-  std::vector<float> hidden((size_t)k * width), grad_hidden((size_t)k * width);
-  for (int i = 0; i < rows; ++i) {
-    for (int n = 0; n < k; ++n) {
-      const float* row = b + (size_t)index[(size_t)i * k + n] * width;
-      for (int d = 0; d < width; d += LANES) {
-        const vec h = load(a + (size_t)i * width + d) + load(row + d);
-        store(&hidden[(size_t)n * width + d], h > 0 ? h : vec{});
+  std::vector<Line> hidden(k), grad_hidden(k), others(count), grad_others(count), w(out_width), grad_w(out_width);
+  const auto take = [width](std::vector<Line>& lines, const float* from) {
+    for (size_t n = 0; n < lines.size(); ++n) lines[n].v = load(from + n * width);
+  };
+  const auto give = [width](const std::vector<Line>& lines, float* to) {
+    for (size_t n = 0; n < lines.size(); ++n) store(to + n * width, lines[n].v);
+  };
+  for (int d = 0; d < width; d += LANES) {
+    take(others, b + d);
+    take(grad_others, grad_b + d);
+    take(w, weight + d);
+    take(grad_w, grad_weight + d);
+    for (int i = 0; i < rows; ++i) {
+      const int32_t* near = index + (size_t)i * k;
+      const vec own = load(a + (size_t)i * width + d);
+      for (int n = 0; n < k; ++n) {
+        const vec h = own + others[near[n]].v;
+        hidden[n].v = h > 0 ? h : vec{};
+        grad_hidden[n].v = vec{};
       }
-    }
-    std::memset(grad_hidden.data(), 0, grad_hidden.size() * sizeof(float));
-    for (int c = 0; c < out_width; ++c) {
-      const vec g = splat(grad[(size_t)i * out_width + c]);
-      const size_t n = arg[(size_t)i * out_width + c];
-      float* gw = grad_weight + (size_t)c * width;
-      const float* w = weight + (size_t)c * width;
-      float* gh = &grad_hidden[n * width];
-      const float* h = &hidden[n * width];
-      for (int d = 0; d < width; d += LANES) {
-        store(gw + d, load(gw + d) + g * load(h + d));
-        store(gh + d, load(gh + d) + g * load(w + d));
+      const float* g = grad + (size_t)i * out_width;
+      const uint8_t* which = arg + (size_t)i * out_width;
+      for (int c = 0; c < out_width; ++c) {
+        const size_t n = which[c];
+        grad_w[c].v += g[c] * hidden[n].v;
+        grad_hidden[n].v += g[c] * w[c].v;
       }
-    }
-    float* ga = grad_a + (size_t)i * width;
-    for (int d = 0; d < width; d += LANES) store(ga + d, vec{});
-    for (int n = 0; n < k; ++n) {
-      float* gb = grad_b + (size_t)index[(size_t)i * k + n] * width;
-      for (int d = 0; d < width; d += LANES) {
-        const vec open = load(&hidden[(size_t)n * width + d]);
-        vec g = load(&grad_hidden[(size_t)n * width + d]);
-        g = open > 0 ? g : vec{};
-        store(ga + d, load(ga + d) + g);
-        store(gb + d, load(gb + d) + g);
+      vec sum = vec{};
+      for (int n = 0; n < k; ++n) {
+        const vec open = hidden[n].v > 0 ? grad_hidden[n].v : vec{};
+        sum += open;
+        grad_others[near[n]].v += open;
       }
+      store(grad_a + (size_t)i * width + d, sum);
     }
+    give(grad_others, grad_b + d);
+    give(grad_w, grad_weight + d);
   }
 }
 

@@ -25,6 +25,14 @@ def test_knn_finds_the_same_neighbours_as_topk(count: int, dims: int) -> None:
 
 
 @kernels
+def test_what_all_points_have_in_common_does_not_blur_their_neighbours() -> None:
+    """Features are positive: far from zero, beside what tells them apart."""
+    x = torch.randn(1, 500, 64, generator=torch.Generator().manual_seed(0))
+    found, expected = ops.knn(x + 50, 32).sort().values, ops.knn(x, 32).sort().values
+    assert (found == expected).float().mean() > 0.998
+
+
+@kernels
 def test_knn_never_returns_the_point_itself() -> None:
     index = ops.knn(torch.randn(1, 500, 3), 32)
     assert not (index == torch.arange(500)[:, None]).any()
@@ -61,6 +69,16 @@ def test_edge_max_agrees_with_the_gathered_form(width: int, out_width: int) -> N
     found = ops.edge_max(a[:, :70], b, index, weight)
     expected = ops.edge_max_torch(a[:, :70].double(), b.double(), index, weight.double())
     assert relative_error(found, expected) < 5e-3  # bfloat16 products where the processor has them
+
+
+@kernels
+@pytest.mark.parametrize("k", [1, 20, 32, 40])
+def test_edge_max_takes_any_number_of_edges(k: int) -> None:
+    generator = torch.Generator().manual_seed(k)
+    a, b = torch.randn(2, 1, 90, 64, generator=generator) - 1  # a missing edge taken for zeros would win
+    weight = -torch.rand(64, 64, generator=generator) / 8
+    index = ops.knn(b, k)
+    assert relative_error(ops.edge_max(a, b, index, weight), ops.edge_max_torch(a, b, index, weight)) < 5e-3
 
 
 @kernels

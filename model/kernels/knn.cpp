@@ -1,0 +1,292 @@
+// k nearest neighbours inside a patch, for one CPU thread; called and twinned as edgeconv.cpp is.
+
+#include "tiles.h"
+#include "vectors.h"
+
+namespace {
+
+constexpr float FAR = 3.4e38f;  // of padding and of the query itself: never chosen
+constexpr int QUERIES = 8;
+constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
+
+// Squared distances of QUERIES queries to all points; `columns` is the patch transposed, (dims, padded).
+inline void distances(const float* columns, int padded, const float* queries, int dims, float* out) {
+  for (int j = 0; j < padded; j += 2 * LANES) {
+    vec sum[QUERIES][2];
+    for (int q = 0; q < QUERIES; ++q) sum[q][0] = sum[q][1] = vec{};
+    for (int d = 0; d < dims; ++d) {
+      const vec c0 = load(columns + (size_t)d * padded + j), c1 = load(columns + (size_t)d * padded + j + LANES);
+      for (int q = 0; q < QUERIES; ++q) {
+        const vec x = splat(queries[(size_t)q * dims + d]);
+        const vec e0 = c0 - x, e1 = c1 - x;
+        sum[q][0] += e0 * e0;
+        sum[q][1] += e1 * e1;
+      }
+    }
+    for (int q = 0; q < QUERIES; ++q) {
+      store(out + (size_t)q * padded + j, sum[q][0]);
+      store(out + (size_t)q * padded + j + LANES, sum[q][1]);
+    }
+  }
+}
+
+// What `select` needs beside its arguments: the candidates of one query, a vector longer than a patch.
+struct Candidates {
+  std::vector<float> distance;
+  std::vector<int32_t> index, chosen;
+  std::vector<uint64_t> keys;
+  explicit Candidates(int padded)
+      : distance(padded + LANES), index(padded + LANES), chosen(padded + LANES), keys(padded) {}
+};
+
+#if defined(__AVX512F__)
+
+// A threshold, as bits, that at least k of `vectors` vectors of floats reach and at most k + spare, where ties allow;
+// `reached` do. All are >= 0, where floats order as their bits do, and at least k are at most `high`. Guessed by
+// interpolation (on a surface as many neighbours come with each further step of squared distance), then halved.
+struct Threshold { int32_t bits; int reached; };
+inline Threshold threshold(const float* values, int vectors, int k, int spare, Threshold high) {
+  Threshold low{-1, 0};
+  for (int tries = 0; high.reached > k + spare && high.bits - low.bits > 1; ++tries) {
+    int32_t guess = low.bits + (high.bits - low.bits) / 2;
+    if (tries % 4 != 3) {
+      const float from = low.bits < 0 ? 0.0f : float_of(low.bits);
+      const float share = (k + 0.5f * (1 + spare) - low.reached) / float(high.reached - low.reached);
+      guess = std::min(std::max(bits_of(from + (float_of(high.bits) - from) * share), low.bits + 1), high.bits - 1);
+    }
+    const __m512i limit = _mm512_set1_epi32(guess);
+    int found = 0;
+    for (int n = 0; n < vectors; ++n)
+      found += __builtin_popcount(_mm512_cmple_epi32_mask(_mm512_loadu_si512(values + n * LANES), limit));
+    (found >= k ? high : low) = {guess, found};
+  }
+  return high;
+}
+
+// Indices of the k smallest distances (ties go to the lower index), in no particular order.
+// The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates.
+inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
+  int32_t bound = bits_of(FAR);
+  if (k <= 4 * LANES) {
+    float least[4 * LANES];
+    __m512 most = _mm512_setzero_ps();
+    for (int g = 0; g < 4; ++g) {
+      __m512 m = _mm512_loadu_ps(distance + g * LANES);
+      for (int j = (g + 4) * LANES; j < padded; j += 4 * LANES) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
+      _mm512_storeu_ps(least + g * LANES, m);
+      most = _mm512_max_ps(most, m);
+    }
+    bound = threshold(least, 4, k, 3, {bits_of(_mm512_reduce_max_ps(most)), 4 * LANES}).bits;
+  }
+  const __m512i limit = _mm512_set1_epi32(bound), far = _mm512_castps_si512(_mm512_set1_ps(FAR));
+  const __m512i step = _mm512_set1_epi32(LANES);
+  __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  int count = 0;
+  for (int j = 0; j < padded; j += LANES, index = _mm512_add_epi32(index, step)) {
+    const __m512i d = _mm512_loadu_si512(distance + j);
+    const __mmask16 chosen = _mm512_cmple_epi32_mask(d, limit) & _mm512_cmplt_epi32_mask(d, far);
+    _mm512_storeu_si512(&near.index[count], _mm512_maskz_compress_epi32(chosen, index));
+    count += __builtin_popcount(chosen);
+  }
+  const int vectors = (count + LANES - 1) / LANES;
+  for (int n = 0; n < vectors; ++n)
+    _mm512_storeu_ps(&near.distance[n * LANES],
+                     _mm512_i32gather_ps(_mm512_loadu_si512(&near.index[n * LANES]), distance, 4));
+  if (count <= k) {  // fewer points than neighbours: in order, then the farthest again
+    for (int n = 0; n < count; ++n)
+      near.keys[n] = (uint64_t(bits_of(near.distance[n])) << 32) | uint32_t(near.index[n]);
+    std::sort(near.keys.begin(), near.keys.begin() + count);
+    for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
+    return;
+  }
+  _mm512_storeu_si512(&near.distance[count], far);
+  const Threshold last = threshold(near.distance.data(), vectors, k, 0, {bound, count});
+  const int32_t sure = last.reached == k ? last.bits : last.bits - 1;  // else some lie exactly there, and not all fit
+  const __m512i within = _mm512_set1_epi32(sure), tied = _mm512_set1_epi32(last.bits);
+  int taken = 0;
+  for (int n = 0; n < vectors; ++n) {
+    const __mmask16 chosen = _mm512_cmple_epi32_mask(_mm512_loadu_si512(&near.distance[n * LANES]), within);
+    const __m512i index = _mm512_loadu_si512(&near.index[n * LANES]);
+    _mm512_storeu_si512(&near.chosen[taken], _mm512_maskz_compress_epi32(chosen, index));
+    taken += __builtin_popcount(chosen);
+  }
+  for (int n = 0; taken < k; ++n)
+    if (bits_of(near.distance[n]) == last.bits) near.chosen[taken++] = near.index[n];
+  std::memcpy(out, near.chosen.data(), (size_t)k * sizeof(int32_t));
+}
+
+#else
+
+// Indices of the k smallest distances (ties go to the lower index), in no particular order.
+// The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few keys.
+inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
+  float bound = FAR;
+  if (k <= 4 * LANES) {
+    float least[4 * LANES];
+    for (int g = 0; g < 4; ++g) {
+      vec m = load(distance + g * LANES);
+      for (int j = g * LANES + 4 * LANES; j < padded; j += 4 * LANES) {
+        const vec d = load(distance + j);
+        m = d < m ? d : m;
+      }
+      store(least + g * LANES, m);
+    }
+    std::nth_element(least, least + k - 1, least + 4 * LANES);
+    bound = least[k - 1];
+  }
+  int count = 0;
+  for (int j = 0; j < padded; ++j)
+    if (distance[j] <= bound && distance[j] < FAR) {
+      uint32_t bits;
+      std::memcpy(&bits, &distance[j], 4);
+      near.keys[count++] = (uint64_t(bits) << 32) | uint32_t(j);
+    }
+  const auto begin = near.keys.begin();
+  if (count > k) std::nth_element(begin, begin + k, begin + count);
+  else std::sort(begin, begin + count);
+  for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
+}
+
+#endif
+
+#if defined(__AMX_BF16__)
+
+// 32 floats as bf16, and what that leaves of them.
+struct Rounded {
+  __m512i high, low;
+  Rounded(__m512 first, __m512 second) : high((__m512i)_mm512_cvtne2ps_pbh(second, first)) {
+    const __m512i even = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_castsi512_si256(high)), 16);
+    const __m512i odd = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(high, 1)), 16);
+    first = _mm512_sub_ps(first, _mm512_castsi512_ps(even));
+    second = _mm512_sub_ps(second, _mm512_castsi512_ps(odd));
+    low = (__m512i)_mm512_cvtne2ps_pbh(second, first);
+  }
+};
+
+// Squared distances in many dimensions by products, |q|^2 + |p|^2 - 2 q p, on tiles. A coordinate is the sum of two
+// bf16, `high` and `low`, of whose products low times low is left out: 2^-16 of |q| |p|. Squares are sums of three.
+class Products {
+ public:
+  Products(const float* points, int count, int dims, int padded)
+      : steps_((dims + DEPTH - 1) / DEPTH), queries_(size_(padded)), points_(size_(padded)) {
+    std::vector<float> mean((size_t)steps_ * DEPTH, 0.0f);  // squares of what all have in common would swallow the rest
+    for (int i = 0; i < count; ++i)
+      for (int d = 0; d < dims; ++d) mean[d] += points[(size_t)i * dims + d] / count;
+    const __m512 twice = _mm512_set1_ps(-2.0f);
+    for (int i = 0; i < count; ++i) {
+      __m512 squares = _mm512_setzero_ps();
+      for (int step = 0; step < steps_; ++step) {
+        __m512 from[2];
+        for (int half = 0; half < 2; ++half) {
+          const int d = step * DEPTH + half * LANES;
+          const __mmask16 some = __mmask16((1u << std::max(0, std::min(LANES, dims - d))) - 1);
+          from[half] = _mm512_maskz_loadu_ps(some, points + (size_t)i * dims + d);
+          from[half] = _mm512_sub_ps(from[half], _mm512_loadu_ps(&mean[d]));
+          squares = _mm512_fmadd_ps(from[half], from[half], squares);
+        }
+        const Rounded query(_mm512_mul_ps(twice, from[0]), _mm512_mul_ps(twice, from[1])), point(from[0], from[1]);
+        put_(i, 2 * step, query.high, point.high);
+        put_(i, 2 * step + 1, query.low, point.low);
+      }
+      // |q|^2 times 1 and 1 times |p|^2, each in three parts
+      float left = _mm512_reduce_add_ps(squares);
+      alignas(64) float query[DEPTH] = {}, point[DEPTH] = {};
+      for (int part = 0; part < 3; ++part) {
+        const float high = float_of(bits_of(left) & ~0xffff);
+        query[part] = point[3 + part] = high;
+        query[3 + part] = point[part] = 1;
+        left -= high;
+      }
+      put_(i, 2 * steps_, bf16_(query), bf16_(point));
+    }
+  }
+
+  // Of 32 queries from `first` on to all points: (32, padded).
+  void distances(int first, int padded, float* out) const {
+    const size_t tile = TILE * DEPTH, row = (2 * steps_ + 1) * tile;
+    const uint16_t* q = queries_.data() + first / TILE * row;
+    for (int j = 0; j < padded; j += 2 * TILE) {
+      const uint16_t* p = points_.data() + j / TILE * row;
+      clear_sums();
+      load_rows(q + 2 * steps_ * tile, row);
+      load_columns(p + 2 * steps_ * tile, row);
+      multiply();
+      for (size_t step = 0; step < 2 * steps_ * tile; step += 2 * tile) {
+        load_rows(q + step + tile, row);  // low
+        load_columns(p + step, row);      // high
+        multiply();
+        load_rows(q + step, row);
+        multiply();
+        load_columns(p + step + tile, row);
+        multiply();
+      }
+      store_sums(out + j, padded);
+    }
+  }
+
+ private:
+  int steps_;
+  std::vector<uint16_t> queries_, points_;  // blocks of 16 points, of each block 2 * steps + 1 tiles
+
+  size_t size_(int padded) const { return (size_t)padded * (2 * steps_ + 1) * DEPTH; }
+
+  static __m512i bf16_(const float* exact) {
+    return Rounded(_mm512_load_ps(exact), _mm512_load_ps(exact + LANES)).high;
+  }
+
+  void put_(int i, int tile, __m512i query, __m512i point) {
+    const size_t place = ((size_t)(i / TILE) * (2 * steps_ + 1) + tile) * TILE * DEPTH;
+    _mm512_storeu_si512(&queries_[place + i % TILE * DEPTH], query);
+    const __m512i pairs = _mm512_setr_epi32(0, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240);
+    _mm512_i32scatter_epi32(&points_[place + i % TILE * 2], pairs, point, 4);
+  }
+};
+
+#endif
+
+}  // namespace
+
+extern "C" {
+
+// points (count, dims), count > 1; queries are the first `rows` of them; out (rows, k) indices, self left out.
+void straightpcf_knn(const float* points, int count, int dims, int rows, int k, int32_t* out) {
+  const int padded = (count + 63) / 64 * 64;
+  Candidates near(padded);
+#if defined(__AMX_BF16__)
+  if (dims >= MANY_DIMS) {
+    const Products products(points, count, dims, padded);
+    std::vector<float> block((size_t)2 * TILE * padded);
+    configure_tiles();
+    for (int first = 0; first < rows; first += 2 * TILE) {
+      products.distances(first, padded, block.data());
+      for (int q = 0; q < std::min(2 * TILE, rows - first); ++q) {
+        float* row = &block[(size_t)q * padded];
+        for (int j = 0; j < padded; j += LANES)  // rounding may leave less than nothing
+          _mm512_storeu_ps(row + j, _mm512_max_ps(_mm512_loadu_ps(row + j), _mm512_setzero_ps()));
+        std::fill(row + count, row + padded, FAR);
+        row[first + q] = FAR;
+        select(row, padded, k, near, out + (size_t)(first + q) * k);
+      }
+    }
+    _tile_release();
+    return;
+  }
+#endif
+  std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)QUERIES * padded);
+  std::vector<float> queries((size_t)QUERIES * dims);
+  for (int i = 0; i < count; ++i)
+    for (int d = 0; d < dims; ++d) columns[(size_t)d * padded + i] = points[(size_t)i * dims + d];
+  for (int first = 0; first < rows; first += QUERIES) {
+    const int block = std::min(QUERIES, rows - first);
+    std::memcpy(queries.data(), points + (size_t)first * dims, (size_t)block * dims * sizeof(float));
+    distances(columns.data(), padded, queries.data(), dims, distance.data());
+    for (int q = 0; q < block; ++q) {
+      float* row = &distance[(size_t)q * padded];
+      std::fill(row + count, row + padded, FAR);
+      row[first + q] = FAR;
+      select(row, padded, k, near, out + (size_t)(first + q) * k);
+    }
+  }
+}
+
+}  // extern "C"

@@ -1,0 +1,48 @@
+// AMX: products of 32 bfloat16 rows with 32 columns, summed in float32, in the eight tile registers of a thread.
+#pragma once
+
+#include "vectors.h"
+
+#if defined(__AMX_BF16__)
+
+namespace {
+
+constexpr int TILE = 16, DEPTH = 32;  // rows of a tile; bf16 of a row, which is also 16 channels of two
+
+// Registers 0 to 3 are sums, 4 and 5 rows, 6 and 7 columns, all of 16 times 64 bytes. They are a thread's own.
+inline void configure_tiles() {
+  struct alignas(64) {
+    uint8_t palette = 1, start = 0, reserved[14] = {};
+    uint16_t bytes[16] = {};
+    uint8_t rows[16] = {};
+  } tiles;
+  for (int t = 0; t < 8; ++t) { tiles.bytes[t] = 64; tiles.rows[t] = TILE; }
+  _tile_loadconfig(&tiles);
+}
+
+// One step of a product: two tiles of rows and two of columns, `gap` apart, are multiplied and added to the sums.
+inline void load_rows(const uint16_t* tiles, size_t gap) {
+  _tile_loadd(4, tiles, 64);
+  _tile_loadd(5, tiles + gap, 64);
+}
+inline void load_columns(const uint16_t* tiles, size_t gap) {
+  _tile_loadd(6, tiles, 64);
+  _tile_loadd(7, tiles + gap, 64);
+}
+inline void multiply() {
+  _tile_dpbf16ps(0, 4, 6);
+  _tile_dpbf16ps(1, 4, 7);
+  _tile_dpbf16ps(2, 5, 6);
+  _tile_dpbf16ps(3, 5, 7);
+}
+inline void clear_sums() { _tile_zero(0); _tile_zero(1); _tile_zero(2); _tile_zero(3); }
+inline void store_sums(float* out, size_t width) {  // 32 rows of a matrix of `width` columns
+  _tile_stored(0, out, width * sizeof(float));
+  _tile_stored(1, out + TILE, width * sizeof(float));
+  _tile_stored(2, out + TILE * width, width * sizeof(float));
+  _tile_stored(3, out + TILE * width + TILE, width * sizeof(float));
+}
+
+}  // namespace
+
+#endif
