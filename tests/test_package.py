@@ -54,6 +54,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         "straightpcf/points/cloud.py",
         "straightpcf/model/kernels/edgeconv.cpp",
         "straightpcf/model/kernels/knn.cpp",
+        "straightpcf/model/kernels/linear.cpp",
         "straightpcf/model/kernels/tiles.h",
         "straightpcf/model/kernels/vectors.h",
         "straightpcf/model/weights/straightpcf.safetensors",

@@ -9,7 +9,7 @@
 
 extern "C" {
 
-// W (out_width, width) -> packed for edge_max. Size: width * out_width floats (bf16 uses half of it).
+// W (out_width, width) -> packed for edge_max and linear. Size: width * out_width floats (bf16 uses half of it).
 void straightpcf_pack(const float* weight, int width, int out_width, float* packed) {
 #if defined(__AVX512BF16__)
   uint16_t* half = reinterpret_cast<uint16_t*>(packed);
@@ -17,8 +17,7 @@ void straightpcf_pack(const float* weight, int width, int out_width, float* pack
     for (int d = 0; d < width; d += 2)
       for (int lane = 0; lane < LANES; ++lane)
         for (int p = 0; p < 2; ++p) {
-          uint32_t bits;
-          std::memcpy(&bits, &weight[(size_t)(c0 + lane) * width + d + p], 4);
+          uint32_t bits = bits_of(weight[(size_t)(c0 + lane) * width + d + p]);
           bits += 0x7fff + ((bits >> 16) & 1);
           half[((size_t)c0 * width) + (size_t)d * LANES + lane * 2 + p] = uint16_t(bits >> 16);
         }
@@ -137,14 +136,8 @@ void edge_max_tiles(const float* a, const float* b, const int32_t* index, const 
       vec best[2] = {splat(-3.4e38f), splat(-3.4e38f)};
       ivec which[2] = {};
       for (int first = 0; first < edges; first += 2 * TILE) {
-        const uint16_t* h = hidden + (size_t)first * width;
-        const uint16_t* w = weight + (size_t)c0 * width;
         clear_sums();
-        for (int d = 0; d < width; d += DEPTH, h += 2 * TILE * DEPTH, w += DEPTH * LANES) {
-          load_rows(h, TILE * DEPTH);
-          load_columns(w, (size_t)LANES * width);
-          multiply();
-        }
+        add_products(hidden + (size_t)first * width, weight + (size_t)c0 * width, width);
         store_sums(sums, 2 * LANES);
         largest(sums, first, best, which, arg != nullptr);
       }

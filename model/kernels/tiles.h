@@ -35,6 +35,14 @@ inline void multiply() {
   _tile_dpbf16ps(2, 5, 6);
   _tile_dpbf16ps(3, 5, 7);
 }
+// Adds 32 rows, as tiles of 32 channels beside each other, times 32 columns packed by straightpcf_pack.
+inline void add_products(const uint16_t* rows, const uint16_t* columns, int width) {
+  for (int d = 0; d < width; d += DEPTH, rows += 2 * TILE * DEPTH, columns += DEPTH * LANES) {
+    load_rows(rows, TILE * DEPTH);
+    load_columns(columns, (size_t)LANES * width);
+    multiply();
+  }
+}
 inline void clear_sums() { _tile_zero(0); _tile_zero(1); _tile_zero(2); _tile_zero(3); }
 inline void store_sums(float* out, size_t width) {  // 32 rows of a matrix of `width` columns
   _tile_stored(0, out, width * sizeof(float));
