@@ -1,5 +1,5 @@
-// A linear layer in bfloat16 with float32 sums on AMX's tiles, for one CPU thread and inference. Elsewhere there is none,
-// and torch does it in float32: see `linear` in model/ops.py.
+// A linear layer in bfloat16 with float32 sums on AMX's tiles, for one CPU thread and inference. Elsewhere torch does
+// it in float32: see `linear` in model/ops.py.
 
 #include "tiles.h"
 #include "vectors.h"
@@ -8,7 +8,7 @@
 
 extern "C" {
 
-// out (rows, out_width) = x (rows, width) W^T + bias, and its positive part if `relu`; `packed` is W by straightpcf_pack,
+// out (rows, out_width) = x (rows, width) W^T + bias, and its positive part if `relu`; `packed` is W by pack,
 // bias may be null; width and out_width are multiples of 32.
 void straightpcf_linear(const float* x, const float* packed, const float* bias, int rows, int width, int out_width,
                         int relu, float* out) {
