@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
 
 from straightpcf.model.kernels import cpu, cuda
 
-__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "linear", "squared_distances"]
+__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "squared_distances"]
 
 
 def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
@@ -50,33 +49,13 @@ def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return distance
 
 
-def linear(
-    x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None, *, relu: bool = False
-) -> torch.Tensor:
-    """Return x @ weight.T + bias, (..., D), of x (..., C) and weight (D, C), and with `relu` its positive part.
-
-    Without a gradient the products are bfloat16 with float32 sums where the processor has tiles for them.
-    """
-    plain = x.device.type == "cpu" and x.dtype == torch.float32
-    if plain and not _wants_gradient(x, weight, bias) and (library := cpu.load()):
-        done = cpu.linear(library, x, weight, bias, relu=relu)
-        if done is not None:
-            return done
-    out = nn.functional.linear(x, weight, bias)
-    return torch.relu(out) if relu else out
-
-
-def _wants_gradient(*tensors: torch.Tensor | None) -> bool:
-    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors if t is not None)
-
-
 def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Take the maximum over a point's edges of the second layer of an EdgeConv.
 
     a: (B, M, C) the point's own share of the first layer; b: (B, P, C) its neighbours' share;
     index: (B, M, k) into P; weight: (D, C). Returns (B, M, D): max_n weight @ relu(a_i + b_index[i, n]).
     """
-    want_grad = _wants_gradient(a, b, weight)
+    want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
     if a.is_cuda and not want_grad and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0 and cuda.load():
         return cuda.edge_max(a, b, index.int(), weight)
     plain = a.dtype == torch.float32 and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0

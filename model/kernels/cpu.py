@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["EdgeMax", "build", "build_all", "instruction_sets", "knn", "linear", "load"]
+__all__ = ["EdgeMax", "build", "build_all", "instruction_sets", "knn", "load", "packed"]
 
 _SOURCES = tuple(sorted(Path(__file__).parent.glob("*.cpp")))
 _HEADERS = tuple(sorted(Path(__file__).parent.glob("*.h")))
@@ -124,9 +124,8 @@ def _file_name(target_set: str) -> str:
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("knn", "pack", "edge_max", "edge_max_backward", "linear"):
-        if hasattr(library, f"straightpcf_{name}"):  # not every instruction set has a linear layer of its own
-            getattr(library, f"straightpcf_{name}").restype = None
+    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused"):
+        getattr(library, f"straightpcf_{name}").restype = None
     library.straightpcf_products_are_bf16.restype = ctypes.c_int
     return library
 
@@ -145,26 +144,11 @@ def knn(library: ctypes.CDLL, x: torch.Tensor, k: int, rows: int) -> torch.Tenso
     return out
 
 
-def _packed(library: ctypes.CDLL, weight: torch.Tensor) -> torch.Tensor:
+def packed(library: ctypes.CDLL, weight: torch.Tensor) -> torch.Tensor:
+    """Return a weight (D, C) float32 as the kernels read it; D a multiple of 16, C even."""
     weight = weight.contiguous()
-    packed = torch.empty_like(weight)
-    library.straightpcf_pack(_at(weight), weight.shape[1], weight.shape[0], _at(packed))
-    return packed
-
-
-def linear(
-    library: ctypes.CDLL, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, *, relu: bool
-) -> torch.Tensor | None:
-    """Return x @ weight.T + bias, x: (..., C), weight: (D, C), or None where these kernels have no such layer."""
-    width, out_width = weight.shape[1], weight.shape[0]
-    if width % 32 or out_width % 32 or not hasattr(library, "straightpcf_linear"):
-        return None
-    x = x.contiguous()
-    out = torch.empty(*x.shape[:-1], out_width)
-    packed = _packed(library, weight)
-    library.straightpcf_linear(
-        _at(x), _at(packed), _at(bias), x.numel() // width, width, out_width, int(relu), _at(out)
-    )  # fmt: skip
+    out = torch.empty_like(weight)
+    library.straightpcf_pack(_at(weight), weight.shape[1], weight.shape[0], _at(out))
     return out
 
 
@@ -177,12 +161,12 @@ class EdgeMax(torch.autograd.Function):
         batch, rows, width = a.shape
         k, out_width = index.shape[2], weight.shape[0]
         a, b, weight = a.contiguous(), b.contiguous(), weight.contiguous()
-        packed = _packed(library, weight)
+        ready = packed(library, weight)
         out = torch.empty(batch, rows, out_width)
         arg = torch.empty(batch, rows, out_width, dtype=torch.uint8) if want_grad else None
         for i in range(batch):
             library.straightpcf_edge_max(
-                _at(a[i]), _at(b[i]), _at(index[i]), _at(packed), rows, k, width, out_width, _at(out[i]),
+                _at(a[i]), _at(b[i]), _at(index[i]), _at(ready), rows, k, width, out_width, _at(out[i]),
                 _at(None if arg is None else arg[i]),
             )  # fmt: skip
         if arg is not None:

@@ -1,9 +1,11 @@
 // The EdgeConv maximum and its gradient, for one CPU thread. Python calls them through ctypes (cpu.py), which
 // releases the GIL, so callers run one patch per thread. Every function has a plain torch twin in model/ops.py.
 //
-// Compiled once per instruction set, with knn.cpp. With AVX512-BF16 the products are bfloat16 with float32 sums,
+// Compiled once per instruction set, with the other .cpp. With AVX512-BF16 the products are bfloat16 with float32 sums,
 // and on AMX's tiles where there are any; otherwise float32 throughout.
 
+#include "kernels.h"
+#include "products.h"
 #include "tiles.h"
 #include "vectors.h"
 
@@ -35,61 +37,24 @@ namespace {
 
 // One block of ROWS edges by COLS*16 channels: products with the packed weight, then the running maximum.
 template <int ROWS, int COLS>
-inline void block(const void* hidden_, int width, const void* packed_, int first, vec* best, ivec* which) {
-#if defined(__AVX512BF16__)
-  const uint16_t* hidden = static_cast<const uint16_t*>(hidden_);
-  const uint16_t* packed = static_cast<const uint16_t*>(packed_);
-  __m512 sum[ROWS][COLS];
-  for (int r = 0; r < ROWS; ++r)
-    for (int c = 0; c < COLS; ++c) sum[r][c] = _mm512_setzero_ps();
-  for (int d = 0; d < width; d += 2) {
-    __m512bh w[COLS];
-    for (int c = 0; c < COLS; ++c)
-      w[c] = (__m512bh)_mm512_loadu_si512(packed + (size_t)c * LANES * width + (size_t)d * LANES);
-    for (int r = 0; r < ROWS; ++r) {
-      int32_t pair;
-      std::memcpy(&pair, hidden + (size_t)r * width + d, 4);
-      const __m512bh h = (__m512bh)_mm512_set1_epi32(pair);
-      for (int c = 0; c < COLS; ++c) sum[r][c] = _mm512_dpbf16_ps(sum[r][c], h, w[c]);
-    }
-  }
-#else
-  const float* hidden = static_cast<const float*>(hidden_);
-  const float* packed = static_cast<const float*>(packed_);
+inline void block(const element* hidden, int width, const element* packed, int first, vec* best, ivec* which) {
   vec sum[ROWS][COLS];
-  for (int r = 0; r < ROWS; ++r)
-    for (int c = 0; c < COLS; ++c) sum[r][c] = vec{};
-  for (int d = 0; d < width; ++d) {
-    vec w[COLS];
-    for (int c = 0; c < COLS; ++c) w[c] = load(packed + (size_t)c * LANES * width + (size_t)d * LANES);
-    for (int r = 0; r < ROWS; ++r) {
-      const vec h = splat(hidden[(size_t)r * width + d]);
-      for (int c = 0; c < COLS; ++c) sum[r][c] += h * w[c];
-    }
-  }
-#endif
+  products<ROWS, COLS>(hidden, width, packed, sum);
   for (int c = 0; c < COLS; ++c)
     for (int r = 0; r < ROWS; ++r) {
-      const vec s = (vec)sum[r][c];
-      const ivec more = s > best[c];
-      best[c] = more ? s : best[c];
+      const ivec more = sum[r][c] > best[c];
+      best[c] = more ? sum[r][c] : best[c];
       which[c] = more ? (ivec{} + (first + r)) : which[c];
     }
 }
 
-// relu(a_i + b_j) for the edges of one point, in the type of the products.
-inline void hidden_rows(const float* a, const float* b, const int32_t* index, int k, int width, void* out_) {
+// relu(a_i + b_j) for the edges of one point.
+inline void hidden_rows(const float* a, const float* b, const int32_t* index, int k, int width, element* out) {
   for (int n = 0; n < k; ++n) {
     const float* row = b + (size_t)index[n] * width;
     for (int d = 0; d < width; d += LANES) {
-      vec h = load(a + d) + load(row + d);
-      h = h > 0 ? h : vec{};
-#if defined(__AVX512BF16__)
-      const __m256bh half = _mm512_cvtneps_pbh((__m512)h);
-      std::memcpy(static_cast<uint16_t*>(out_) + (size_t)n * width + d, &half, 32);
-#else
-      store(static_cast<float*>(out_) + (size_t)n * width + d, h);
-#endif
+      const vec h = load(a + d) + load(row + d);
+      put(out + (size_t)n * width + d, h > 0 ? h : vec{});
     }
   }
 }
@@ -155,25 +120,21 @@ void edge_max_tiles(const float* a, const float* b, const int32_t* index, const 
 #endif
 
 template <int COLS>
-void edge_max(const float* a, const float* b, const int32_t* index, const float* packed, int rows, int k, int width,
+void edge_max(const float* a, const float* b, const int32_t* index, const float* packed_, int rows, int k, int width,
               int out_width, float* out, uint8_t* arg) {
-  std::vector<float> scratch((size_t)(k + 8) * width + LANES);
-  char* hidden = reinterpret_cast<char*>(scratch.data());
-#if defined(__AVX512BF16__)
-  const size_t element = 2;
-#else
-  const size_t element = 4;
-#endif
+  std::vector<element> scratch((size_t)(k + 8) * width + LANES);
+  element* hidden = scratch.data();
+  const element* packed = reinterpret_cast<const element*>(packed_);
   for (int i = 0; i < rows; ++i) {
     hidden_rows(a + (size_t)i * width, b, index + (size_t)i * k, k, width, hidden);
     for (int c0 = 0; c0 < out_width; c0 += COLS * LANES) {
       vec best[COLS];
       ivec which[COLS];
       for (int c = 0; c < COLS; ++c) { best[c] = splat(-3.4e38f); which[c] = ivec{}; }
-      const char* w = reinterpret_cast<const char*>(packed) + (size_t)c0 * width * element;
+      const element* w = packed + (size_t)c0 * width;
       int n = 0;
-      for (; n + 8 <= k; n += 8) block<8, COLS>(hidden + (size_t)n * width * element, width, w, n, best, which);
-      for (; n < k; ++n) block<1, COLS>(hidden + (size_t)n * width * element, width, w, n, best, which);
+      for (; n + 8 <= k; n += 8) block<8, COLS>(hidden + (size_t)n * width, width, w, n, best, which);
+      for (; n < k; ++n) block<1, COLS>(hidden + (size_t)n * width, width, w, n, best, which);
       for (int c = 0; c < COLS; ++c) {
         store(out + (size_t)i * out_width + c0 + c * LANES, best[c]);
         if (arg)

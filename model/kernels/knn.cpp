@@ -1,5 +1,6 @@
 // k nearest neighbours inside a patch, for one CPU thread; called and twinned as edgeconv.cpp is.
 
+#include "kernels.h"
 #include "tiles.h"
 #include "vectors.h"
 

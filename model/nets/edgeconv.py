@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import nn
 
-from straightpcf.model.ops import edge_max, knn, linear
+from straightpcf.model.ops import edge_max, knn
 
 __all__ = ["NEIGHBOURS", "Decoder", "EdgeConv", "Encoder"]
 
@@ -29,11 +29,11 @@ class EdgeConv(nn.Module):
         rows = x[:, : index.shape[1]]
         # [x_i, x_j - x_i] W = x_i (W_a - W_b) + x_j W_b: the first layer runs per point, not per edge.
         own, other = first.weight[:, : x.shape[2]], first.weight[:, x.shape[2] :]
-        a = linear(rows, own - other, first.bias)
-        b = linear(x, other)
+        a = nn.functional.linear(rows, own - other, first.bias)
+        b = nn.functional.linear(x, other)
         edges = edge_max(a, b, index, second.weight) + second.bias
-        skip = linear(rows, self.lin.weight, self.lin.bias, relu=self.activation)
-        return torch.relu(edges) + skip if self.activation else edges + skip
+        skip = self.lin(rows)
+        return torch.relu(edges) + torch.relu(skip) if self.activation else edges + skip
 
 
 class Encoder(nn.Module):
@@ -71,16 +71,7 @@ class Decoder(nn.Module):
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Map (B, M, D) to (B, M, out), or to (B, out) with `pool`."""
         h = features.flatten(0, 1)
-        h = self.dropout(self._layer(h, self.lin_1, self.bn_1_out))
-        h = self.dropout(self._layer(h, self.lin_2, self.bn_2_out))
+        h = self.dropout(torch.relu(self.bn_1_out(self.lin_1(h))))
+        h = self.dropout(torch.relu(self.bn_2_out(self.lin_2(h))))
         h = h.unflatten(0, features.shape[:2])  # (B, M, 64)
         return self.lin_3(h.amax(dim=1) if self.pool else h)  # type: ignore[no-any-return]
-
-    @staticmethod
-    def _layer(h: torch.Tensor, lin: nn.Linear, norm: nn.BatchNorm1d) -> torch.Tensor:
-        """Return relu(norm(lin(h))); what does not depend on the batch is one linear layer."""
-        if norm.training or torch.is_grad_enabled():
-            return torch.relu(norm(lin(h)))
-        scale = cast(torch.Tensor, norm.running_var).add(norm.eps).rsqrt() * norm.weight
-        bias = (lin.bias - cast(torch.Tensor, norm.running_mean)) * scale + norm.bias
-        return linear(h, lin.weight * scale[:, None], bias, relu=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from straightpcf.model.nets.edgeconv import Decoder, Encoder
+from straightpcf.model.kernels.fused import fused
+from straightpcf.model.nets.edgeconv import NEIGHBOURS, Decoder, Encoder
 
 __all__ = ["DistanceModule", "StraightPCF", "VelocityModule"]
 
@@ -23,6 +24,8 @@ class VelocityModule(nn.Module):
 
     def forward(self, x: torch.Tensor, rows: int | None = None) -> torch.Tensor:
         """Return (B, rows, 3) velocities of the first `rows` points of each patch x (B, P, 3)."""
+        if whole := fused(self, self.encoder, self.decoder, x, NEIGHBOURS):
+            return whole(x, rows)
         return self.decoder(self.encoder(x, rows))  # type: ignore[no-any-return]
 
     def start_slow(self) -> VelocityModule:
@@ -48,7 +51,9 @@ class DistanceModule(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return (B, 1) distances of patches x (B, P, 3), centred on their seeds."""
-        return torch.sigmoid(self.decoder(self.encoder(x * _PATCHES_PER_RADIUS)))
+        x = x * _PATCHES_PER_RADIUS
+        whole = fused(self, self.encoder, self.decoder, x, NEIGHBOURS)
+        return torch.sigmoid(whole(x) if whole else self.decoder(self.encoder(x)))
 
 
 class StraightPCF(nn.Module):

@@ -101,25 +101,6 @@ def test_edge_max_gradient_is_exact_along_the_winning_edges() -> None:
         assert relative_error(ours, theirs) < 1e-5
 
 
-@pytest.mark.parametrize(("shape", "out_width"), [((70, 96), 256), ((2, 33, 32), 64), ((50, 48), 128), ((50, 64), 3)])
-@pytest.mark.parametrize("relu", [False, True])
-def test_linear_agrees_with_torch(shape: tuple[int, ...], out_width: int, relu: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    x, weight = torch.randn(shape, generator=generator), torch.randn(out_width, shape[-1], generator=generator)
-    bias = torch.randn(out_width, generator=generator)
-    for given in (bias, None):
-        expected = torch.nn.functional.linear(x, weight, given)
-        found = ops.linear(x, weight, given, relu=relu)
-        assert relative_error(found, torch.relu(expected) if relu else expected) < 5e-3
-
-
-def test_a_linear_layer_that_is_trained_is_in_float32() -> None:
-    x, weight = torch.randn(64, 64), torch.randn(64, 64, requires_grad=True)
-    assert torch.equal(ops.linear(x, weight), torch.nn.functional.linear(x, weight))
-    (gradient,) = torch.autograd.grad(ops.linear(x, weight, relu=True).sum(), weight)
-    assert gradient.norm() > 0
-
-
 @kernels
 def test_loading_the_kernels_leaves_subnormal_numbers_alone() -> None:
     cpu.load()
