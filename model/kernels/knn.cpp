@@ -74,6 +74,7 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
     for (int g = 0; g < 4; ++g) {
       __m512 m = _mm512_loadu_ps(distance + g * LANES);
       for (int j = (g + 4) * LANES; j < padded; j += 4 * LANES) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
+      m = _mm512_max_ps(m, _mm512_setzero_ps());  // rounding may leave less than nothing, which orders the other way
       _mm512_storeu_ps(least + g * LANES, m);
       most = _mm512_max_ps(most, m);
     }
@@ -92,7 +93,8 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   const int vectors = (count + LANES - 1) / LANES;
   for (int n = 0; n < vectors; ++n)
     _mm512_storeu_ps(&near.distance[n * LANES],
-                     _mm512_i32gather_ps(_mm512_loadu_si512(&near.index[n * LANES]), distance, 4));
+                     _mm512_max_ps(_mm512_i32gather_ps(_mm512_loadu_si512(&near.index[n * LANES]), distance, 4),
+                                   _mm512_setzero_ps()));
   if (count <= k) {  // fewer points than neighbours: in order, then the farthest again
     for (int n = 0; n < count; ++n)
       near.keys[n] = (uint64_t(bits_of(near.distance[n])) << 32) | uint32_t(near.index[n]);
@@ -202,8 +204,8 @@ class Products {
     }
   }
 
-  // Of 32 queries from `first` on to all points: (32, padded).
-  void distances(int first, int padded, float* out) const {
+  // Of 32 queries from `first` on to all points: (32, padded), `stride` floats from one to the next.
+  void distances(int first, int padded, float* out, int stride) const {
     const size_t tile = TILE * DEPTH, row = (2 * steps_ + 1) * tile;
     const uint16_t* q = queries_.data() + first / TILE * row;
     for (int j = 0; j < padded; j += 2 * TILE) {
@@ -221,7 +223,7 @@ class Products {
         load_columns(p + step + tile, row);
         multiply();
       }
-      store_sums(out + j, padded);
+      store_sums(out + j, stride);
     }
   }
 
@@ -256,14 +258,13 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
 #if defined(__AMX_BF16__)
   if (dims >= MANY_DIMS) {
     const Products products(points, count, dims, padded);
-    std::vector<float> block((size_t)2 * TILE * padded);
+    const int stride = padded + LANES;  // rows 4 KiB apart would share a set of the cache
+    std::vector<float> block((size_t)2 * TILE * stride);
     configure_tiles();
     for (int first = 0; first < rows; first += 2 * TILE) {
-      products.distances(first, padded, block.data());
+      products.distances(first, padded, block.data(), stride);
       for (int q = 0; q < std::min(2 * TILE, rows - first); ++q) {
-        float* row = &block[(size_t)q * padded];
-        for (int j = 0; j < padded; j += LANES)  // rounding may leave less than nothing
-          _mm512_storeu_ps(row + j, _mm512_max_ps(_mm512_loadu_ps(row + j), _mm512_setzero_ps()));
+        float* row = &block[(size_t)q * stride];
         std::fill(row + count, row + padded, FAR);
         row[first + q] = FAR;
         select(row, padded, k, near, out + (size_t)(first + q) * k);
