@@ -124,7 +124,7 @@ def _file_name(target_set: str) -> str:
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused"):
+    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused", "pack_linear"):
         getattr(library, f"straightpcf_{name}").restype = None
     library.straightpcf_products_are_bf16.restype = ctypes.c_int
     return library
@@ -144,11 +144,15 @@ def knn(library: ctypes.CDLL, x: torch.Tensor, k: int, rows: int) -> torch.Tenso
     return out
 
 
-def packed(library: ctypes.CDLL, weight: torch.Tensor) -> torch.Tensor:
-    """Return a weight (D, C) float32 as the kernels read it; D a multiple of 16, C even."""
+def packed(library: ctypes.CDLL, weight: torch.Tensor, *, edges: bool) -> torch.Tensor:
+    """Return a weight (D, C) float32 as the kernels read it.
+
+    edges: for the maximum over edges, D a multiple of 16 and C even; else for a linear layer, both multiples of 32.
+    """
     weight = weight.contiguous()
     out = torch.empty_like(weight)
-    library.straightpcf_pack(_at(weight), weight.shape[1], weight.shape[0], _at(out))
+    pack = library.straightpcf_pack if edges else library.straightpcf_pack_linear
+    pack(_at(weight), weight.shape[1], weight.shape[0], _at(out))
     return out
 
 
@@ -161,7 +165,7 @@ class EdgeMax(torch.autograd.Function):
         batch, rows, width = a.shape
         k, out_width = index.shape[2], weight.shape[0]
         a, b, weight = a.contiguous(), b.contiguous(), weight.contiguous()
-        ready = packed(library, weight)
+        ready = packed(library, weight, edges=True)
         out = torch.empty(batch, rows, out_width)
         arg = torch.empty(batch, rows, out_width, dtype=torch.uint8) if want_grad else None
         for i in range(batch):

@@ -11,7 +11,7 @@
 
 extern "C" {
 
-// W (out_width, width) -> packed for edge_max and linear. Size: width * out_width floats (bf16 uses half of it).
+// W (out_width, width) -> packed for edge_max. Size: width * out_width floats (bf16 uses half of it).
 void straightpcf_pack(const float* weight, int width, int out_width, float* packed) {
 #if defined(__AVX512BF16__)
   uint16_t* half = reinterpret_cast<uint16_t*>(packed);

@@ -34,20 +34,43 @@ struct Block {
   const float *own, *own_bias, *other, *other_bias, *second, *second_bias, *lin, *lin_bias;
 };
 
+// A linear layer of three inputs or three outputs, in float32:
+// out (rows, out_width) = x (rows, width) weight (width, out_width) + bias.
+void exact(const float* x, int stride, const float* weight, const float* bias, int rows, int width, int out_width,
+           float* out) {
+  for (int i = 0; i < rows; ++i)
+    for (int c = 0; c < out_width; c += LANES) {
+      vec sum = load(bias + c);
+      for (int d = 0; d < width; ++d)
+        sum += splat(x[(size_t)i * stride + d]) * load(weight + (size_t)d * out_width + c);
+      store(out + (size_t)i * out_width + c, sum);
+    }
+}
+
+// The per-point layers of a block, of positions (width 3) or of features.
+void layer(const float* x, int stride, const float* weight, const float* bias, int rows, int width, int out_width,
+           float* out) {
+  if (width < WIDE)
+    exact(x, stride, weight, bias, rows, width, out_width, out);
+  else
+    straightpcf_linear(x, stride, weight, bias, rows, width, out_width, 0, out);
+}
+
 // out (rows, out_stride) = max_j MLP([x_i, x_j - x_i]) + Lin(x_i), x (count, stride), by the graph of `features`.
 void edge_conv(const float* x, int count, int stride, int width, const float* features, int dims, int rows, int k,
                const Block& w, int out_width, bool activation, float* a, float* b, float* edges, int32_t* index,
                float* out, int out_stride) {
   straightpcf_knn(features, count, dims, rows, k, index);
-  straightpcf_linear(x, stride, w.own, w.own_bias, rows, width, out_width, 0, a);
-  straightpcf_linear(x, stride, w.other, w.other_bias, count, width, out_width, 0, b);
+  layer(x, stride, w.own, w.own_bias, rows, width, out_width, a);
+  layer(x, stride, w.other, w.other_bias, count, width, out_width, b);
   straightpcf_edge_max(a, b, index, w.second, rows, k, out_width, out_width, edges, nullptr);
-  straightpcf_linear(x, stride, w.lin, w.lin_bias, rows, width, out_width, activation, a);
+  layer(x, stride, w.lin, w.lin_bias, rows, width, out_width, a);
+  const vec least = splat(activation ? 0.0f : -3.4e38f);
   for (int i = 0; i < rows; ++i)
     for (int c = 0; c < out_width; c += LANES) {
-      vec v = load(edges + (size_t)i * out_width + c) + load(w.second_bias + c);
-      if (activation) v = v > 0 ? v : vec{};
-      store(out + (size_t)i * out_stride + c, v + load(a + (size_t)i * out_width + c));
+      const vec edge = load(edges + (size_t)i * out_width + c) + load(w.second_bias + c);
+      const vec skip = load(a + (size_t)i * out_width + c);
+      store(out + (size_t)i * out_stride + c, (edge > least ? edge : least) + (skip > least ? skip : least));
     }
 }
 
@@ -63,8 +86,8 @@ void straightpcf_fused(const float* x, int count, int rows, int k, const float* 
   const int hidden = wide(widths[3]), last = wide(widths[4]), outputs = wide(widths[5]);
   const int widest = std::max(std::max(first, second), std::max(third, hidden));
   const size_t points = count, each = points * widest;
-  Buffers buffers(points * (WIDE + joined + std::max(first, second) + k + 2 * LANES) + 4 * each + 16 * LANES);
-  float *wide_x = buffers.take(points * WIDE), *both = buffers.take(points * joined);
+  Buffers buffers(points * (joined + std::max(first, second) + k) + 4 * each + 8 * LANES);
+  float *both = buffers.take(points * joined);
   float *features = buffers.take(points * std::max(first, second));
   float *a = buffers.take(each), *b = buffers.take(each), *edges = buffers.take(each), *whole = buffers.take(each);
   int32_t* index = reinterpret_cast<int32_t*>(buffers.take(points * k));
@@ -72,9 +95,7 @@ void straightpcf_fused(const float* x, int count, int rows, int k, const float* 
   std::memcpy(blocks, layers, sizeof blocks);
   const float* const* decoder = layers + sizeof blocks / sizeof *layers;
 
-  std::fill(wide_x, wide_x + points * WIDE, 0.0f);
-  for (int i = 0; i < count; ++i) std::memcpy(wide_x + (size_t)i * WIDE, x + (size_t)i * 3, 3 * sizeof(float));
-  edge_conv(wide_x, count, WIDE, WIDE, x, 3, count, k, blocks[0], first, true, a, b, edges, index, both, joined);
+  edge_conv(x, count, 3, 3, x, 3, count, k, blocks[0], first, true, a, b, edges, index, both, joined);
   for (int i = 0; i < count; ++i)
     std::memcpy(features + (size_t)i * first, both + (size_t)i * joined, first * sizeof(float));
   edge_conv(both, count, joined, first, features, first, count, k, blocks[1], second, true, a, b, edges, index,
@@ -90,7 +111,7 @@ void straightpcf_fused(const float* x, int count, int rows, int k, const float* 
     for (int i = 1; i < rows; ++i)
       for (int c = 0; c < last; ++c) b[c] = std::max(b[c], b[(size_t)i * last + c]);
   const int left = pool ? 1 : rows;
-  straightpcf_linear(b, last, decoder[4], decoder[5], left, last, outputs, 0, a);
+  exact(b, last, decoder[4], decoder[5], left, last, outputs, a);
   for (int i = 0; i < left; ++i)
     std::memcpy(out + (size_t)i * widths[5], a + (size_t)i * outputs, widths[5] * sizeof(float));
 }

@@ -58,10 +58,12 @@ class Fused:
         """Yield what `Block` in fused.cpp lists; parts: the widths of the inputs that lie side by side."""
         hidden, second = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
         own, other = hidden.weight.chunk(2, dim=1)
-        yield from self._layer(own - other, hidden.bias, parts)  # the first layer runs per point, not per edge
-        yield from self._layer(other, None, parts)
-        yield from self._layer(second.weight, second.bias, [second.in_features])
-        yield from self._layer(block.lin.weight, block.lin.bias, parts)
+        # The first layer runs per point, not per edge.
+        for weight, bias in ((own - other, hidden.bias), (other, torch.zeros_like(hidden.bias))):
+            yield from self._exact(weight, bias) if parts == [3] else self._layer(weight, bias, parts)
+        yield from self._layer(second.weight, second.bias, [second.in_features], edges=True)
+        skip = block.lin
+        yield from self._exact(skip.weight, skip.bias) if parts == [3] else self._layer(skip.weight, skip.bias, parts)
 
     def _decoder(self, decoder: Decoder) -> Iterator[torch.Tensor]:
         for lin, norm in ((decoder.lin_1, decoder.bn_1_out), (decoder.lin_2, decoder.bn_2_out)):
@@ -70,17 +72,26 @@ class Fused:
                 norm.eps, norm.weight, norm.bias,
             )  # fmt: skip
             yield from self._layer(weight, bias, [lin.in_features])
-        yield from self._layer(decoder.lin_3.weight, decoder.lin_3.bias, [decoder.lin_3.in_features])
+        yield from self._exact(decoder.lin_3.weight, decoder.lin_3.bias)
 
-    def _layer(self, weight: torch.Tensor, bias: torch.Tensor | None, parts: list[int]) -> Iterator[torch.Tensor]:
-        """Yield a weight (D, C), packed, and a bias (D,), zeros if None, both filled up."""
+    def _layer(
+        self, weight: torch.Tensor, bias: torch.Tensor, parts: list[int], *, edges: bool = False
+    ) -> Iterator[torch.Tensor]:
+        """Yield a weight (D, C), packed, and its bias (D,), filled up: the C columns part by part."""
         rows, starts = _filled(len(weight)) - len(weight), [sum(parts[:n]) for n in range(len(parts))]
         columns = [
             nn.functional.pad(weight[:, start : start + part], (0, _filled(part) - part, 0, rows))
             for start, part in zip(starts, parts, strict=True)
         ]
-        yield cpu.packed(self._library, torch.cat(columns, dim=1))
-        yield nn.functional.pad(torch.zeros(len(weight)) if bias is None else bias, (0, rows))
+        yield cpu.packed(self._library, torch.cat(columns, dim=1), edges=edges)
+        yield nn.functional.pad(bias, (0, rows))
+
+    @staticmethod
+    def _exact(weight: torch.Tensor, bias: torch.Tensor) -> Iterator[torch.Tensor]:
+        """Yield what `exact` in fused.cpp reads: a weight (D, C) as (C, D), and its bias (D,), D filled up."""
+        rows = _filled(len(weight)) - len(weight)
+        yield nn.functional.pad(weight.T, (0, rows)).contiguous()
+        yield nn.functional.pad(bias, (0, rows)).contiguous()
 
 
 _KNOWN: weakref.WeakKeyDictionary[nn.Module, tuple[object, Fused]] = weakref.WeakKeyDictionary()

@@ -154,18 +154,6 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
 
 #if defined(__AMX_BF16__)
 
-// 32 floats as bf16, and what that leaves of them.
-struct Rounded {
-  __m512i high, low;
-  Rounded(__m512 first, __m512 second) : high((__m512i)_mm512_cvtne2ps_pbh(second, first)) {
-    const __m512i even = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_castsi512_si256(high)), 16);
-    const __m512i odd = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(high, 1)), 16);
-    first = _mm512_sub_ps(first, _mm512_castsi512_ps(even));
-    second = _mm512_sub_ps(second, _mm512_castsi512_ps(odd));
-    low = (__m512i)_mm512_cvtne2ps_pbh(second, first);
-  }
-};
-
 // Squared distances in many dimensions by products, |q|^2 + |p|^2 - 2 q p, on tiles. A coordinate is the sum of two
 // bf16, `high` and `low`, of whose products low times low is left out: 2^-16 of |q| |p|. Squares are sums of three.
 class Products {
@@ -240,8 +228,7 @@ class Products {
   void put_(int i, int tile, __m512i query, __m512i point) {
     const size_t place = ((size_t)(i / TILE) * (2 * steps_ + 1) + tile) * TILE * DEPTH;
     _mm512_storeu_si512(&queries_[place + i % TILE * DEPTH], query);
-    const __m512i pairs = _mm512_setr_epi32(0, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240);
-    _mm512_i32scatter_epi32(&points_[place + i % TILE * 2], pairs, point, 4);
+    scatter_column(&points_[place + i % TILE * 2], point);
   }
 };
 

@@ -20,6 +20,24 @@ inline void configure_tiles() {
   _tile_loadconfig(&tiles);
 }
 
+// 32 floats as bf16, and what that leaves of them.
+struct Rounded {
+  __m512i high, low;
+  Rounded(__m512 first, __m512 second) : high((__m512i)_mm512_cvtne2ps_pbh(second, first)) {
+    const __m512i even = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_castsi512_si256(high)), 16);
+    const __m512i odd = _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(high, 1)), 16);
+    first = _mm512_sub_ps(first, _mm512_castsi512_ps(even));
+    second = _mm512_sub_ps(second, _mm512_castsi512_ps(odd));
+    low = (__m512i)_mm512_cvtne2ps_pbh(second, first);
+  }
+};
+
+// 32 values of one column, a pair to a row, into their tile.
+inline void scatter_column(uint16_t* to, __m512i values) {
+  const __m512i rows = _mm512_setr_epi32(0, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240);
+  _mm512_i32scatter_epi32(to, rows, values, 4);
+}
+
 // One step of a product: two tiles of rows and two of columns, `gap` apart, are multiplied and added to the sums.
 inline void load_rows(const uint16_t* tiles, size_t gap) {
   _tile_loadd(4, tiles, 64);
