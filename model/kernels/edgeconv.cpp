@@ -35,13 +35,13 @@ void straightpcf_pack(const float* weight, int width, int out_width, float* pack
 
 namespace {
 
-// One block of ROWS edges by COLS*16 channels: products with the packed weight, then the running maximum.
-template <int ROWS, int COLS>
+// One block of R edges by 16 C channels: products with the packed weight, then the running maximum.
+template <int R, int C>
 inline void block(const element* hidden, int width, const element* packed, int first, vec* best, ivec* which) {
-  vec sum[ROWS][COLS];
-  products<ROWS, COLS>(hidden, width, packed, sum);
-  for (int c = 0; c < COLS; ++c)
-    for (int r = 0; r < ROWS; ++r) {
+  vec sum[R][C];
+  products<R, C>(hidden, width, packed, sum);
+  for (int c = 0; c < C; ++c)
+    for (int r = 0; r < R; ++r) {
       const ivec more = sum[r][c] > best[c];
       best[c] = more ? sum[r][c] : best[c];
       which[c] = more ? (ivec{} + (first + r)) : which[c];
@@ -119,23 +119,23 @@ void edge_max_tiles(const float* a, const float* b, const int32_t* index, const 
 
 #endif
 
-template <int COLS>
+template <int C>
 void edge_max(const float* a, const float* b, const int32_t* index, const float* packed_, int rows, int k, int width,
               int out_width, float* out, uint8_t* arg) {
-  std::vector<element> scratch((size_t)(k + 8) * width + LANES);
+  std::vector<element> scratch((size_t)(k + ROWS) * width + LANES);
   element* hidden = scratch.data();
   const element* packed = reinterpret_cast<const element*>(packed_);
   for (int i = 0; i < rows; ++i) {
     hidden_rows(a + (size_t)i * width, b, index + (size_t)i * k, k, width, hidden);
-    for (int c0 = 0; c0 < out_width; c0 += COLS * LANES) {
-      vec best[COLS];
-      ivec which[COLS];
-      for (int c = 0; c < COLS; ++c) { best[c] = splat(-3.4e38f); which[c] = ivec{}; }
+    for (int c0 = 0; c0 < out_width; c0 += C * LANES) {
+      vec best[C];
+      ivec which[C];
+      for (int c = 0; c < C; ++c) { best[c] = splat(-3.4e38f); which[c] = ivec{}; }
       const element* w = packed + (size_t)c0 * width;
       int n = 0;
-      for (; n + 8 <= k; n += 8) block<8, COLS>(hidden + (size_t)n * width, width, w, n, best, which);
-      for (; n < k; ++n) block<1, COLS>(hidden + (size_t)n * width, width, w, n, best, which);
-      for (int c = 0; c < COLS; ++c) {
+      for (; n + ROWS <= k; n += ROWS) block<ROWS, C>(hidden + (size_t)n * width, width, w, n, best, which);
+      for (; n < k; ++n) block<1, C>(hidden + (size_t)n * width, width, w, n, best, which);
+      for (int c = 0; c < C; ++c) {
         store(out + (size_t)i * out_width + c0 + c * LANES, best[c]);
         if (arg)
           for (int lane = 0; lane < LANES; ++lane)
@@ -156,8 +156,8 @@ void straightpcf_edge_max(const float* a, const float* b, const int32_t* index, 
   if (width % DEPTH == 0 && out_width % (2 * LANES) == 0)
     return edge_max_tiles(a, b, index, packed, rows, k, width, out_width, out, arg);
 #endif
-  if (out_width % (2 * LANES) == 0)
-    edge_max<2>(a, b, index, packed, rows, k, width, out_width, out, arg);
+  if (out_width % (COLS * LANES) == 0)
+    edge_max<COLS>(a, b, index, packed, rows, k, width, out_width, out, arg);
   else
     edge_max<1>(a, b, index, packed, rows, k, width, out_width, out, arg);
 }

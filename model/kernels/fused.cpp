@@ -14,12 +14,12 @@ inline int wide(int width) { return (width + WIDE - 1) / WIDE * WIDE; }
 class Buffers {
  public:
   explicit Buffers(size_t floats) {
-    if (kept_.size() < floats + LANES) kept_.resize(floats + LANES);
+    if (kept_.size() < floats + 16) kept_.resize(floats + 16);
     next_ = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(kept_.data()) + 63) / 64 * 64);
   }
-  float* take(size_t floats) {  // a multiple of 16 at a time keeps them aligned
+  float* take(size_t floats) {  // a multiple of a cache line at a time keeps them aligned
     float* here = next_;
-    next_ += (floats + LANES - 1) / LANES * LANES;
+    next_ += (floats + 15) / 16 * 16;
     return here;
   }
 
@@ -86,7 +86,7 @@ void straightpcf_fused(const float* x, int count, int rows, int k, const float* 
   const int hidden = wide(widths[3]), last = wide(widths[4]), outputs = wide(widths[5]);
   const int widest = std::max(std::max(first, second), std::max(third, hidden));
   const size_t points = count, each = points * widest;
-  Buffers buffers(points * (joined + std::max(first, second) + k) + 4 * each + 8 * LANES);
+  Buffers buffers(points * (joined + std::max(first, second) + k) + 4 * each + 8 * 16);
   float *both = buffers.take(points * joined);
   float *features = buffers.take(points * std::max(first, second));
   float *a = buffers.take(each), *b = buffers.take(each), *edges = buffers.take(each), *whole = buffers.take(each);

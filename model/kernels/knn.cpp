@@ -7,27 +7,28 @@
 namespace {
 
 constexpr float FAR = 3.4e38f;  // of padding and of the query itself: never chosen
-constexpr int QUERIES = 8;
+constexpr int GROUPS = 64;      // disjoint, of a patch filled up to a multiple of them: see `select`
 constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
 
-// Squared distances of QUERIES queries to all points; `columns` is the patch transposed, (dims, padded).
+// Squared distances of ROWS queries to all points; `columns` is the patch transposed, (dims, padded).
 inline void distances(const float* columns, int padded, const float* queries, int dims, float* out) {
-  for (int j = 0; j < padded; j += 2 * LANES) {
-    vec sum[QUERIES][2];
-    for (int q = 0; q < QUERIES; ++q) sum[q][0] = sum[q][1] = vec{};
+  for (int j = 0; j < padded; j += COLS * LANES) {
+    vec sum[ROWS][COLS];
+    for (int q = 0; q < ROWS; ++q)
+      for (int c = 0; c < COLS; ++c) sum[q][c] = vec{};
     for (int d = 0; d < dims; ++d) {
-      const vec c0 = load(columns + (size_t)d * padded + j), c1 = load(columns + (size_t)d * padded + j + LANES);
-      for (int q = 0; q < QUERIES; ++q) {
-        const vec x = splat(queries[(size_t)q * dims + d]);
-        const vec e0 = c0 - x, e1 = c1 - x;
-        sum[q][0] += e0 * e0;
-        sum[q][1] += e1 * e1;
+      vec x[COLS];
+      for (int c = 0; c < COLS; ++c) x[c] = load(columns + (size_t)d * padded + j + c * LANES);
+      for (int q = 0; q < ROWS; ++q) {
+        const vec from = splat(queries[(size_t)q * dims + d]);
+        for (int c = 0; c < COLS; ++c) {
+          const vec apart = x[c] - from;
+          sum[q][c] += apart * apart;
+        }
       }
     }
-    for (int q = 0; q < QUERIES; ++q) {
-      store(out + (size_t)q * padded + j, sum[q][0]);
-      store(out + (size_t)q * padded + j + LANES, sum[q][1]);
-    }
+    for (int q = 0; q < ROWS; ++q)
+      for (int c = 0; c < COLS; ++c) store(out + (size_t)q * padded + j + c * LANES, sum[q][c]);
   }
 }
 
@@ -68,17 +69,17 @@ inline Threshold threshold(const float* values, int vectors, int k, int spare, T
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates.
 inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
   int32_t bound = bits_of(FAR);
-  if (k <= 4 * LANES) {
-    float least[4 * LANES];
+  if (k <= GROUPS) {
+    float least[GROUPS];
     __m512 most = _mm512_setzero_ps();
-    for (int g = 0; g < 4; ++g) {
-      __m512 m = _mm512_loadu_ps(distance + g * LANES);
-      for (int j = (g + 4) * LANES; j < padded; j += 4 * LANES) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
+    for (int g = 0; g < GROUPS; g += LANES) {
+      __m512 m = _mm512_loadu_ps(distance + g);
+      for (int j = g + GROUPS; j < padded; j += GROUPS) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
       m = _mm512_max_ps(m, _mm512_setzero_ps());  // rounding may leave less than nothing, which orders the other way
-      _mm512_storeu_ps(least + g * LANES, m);
+      _mm512_storeu_ps(least + g, m);
       most = _mm512_max_ps(most, m);
     }
-    bound = threshold(least, 4, k, 3, {bits_of(_mm512_reduce_max_ps(most)), 4 * LANES}).bits;
+    bound = threshold(least, GROUPS / LANES, k, 3, {bits_of(_mm512_reduce_max_ps(most)), GROUPS}).bits;
   }
   const __m512i limit = _mm512_set1_epi32(bound), far = _mm512_castps_si512(_mm512_set1_ps(FAR));
   const __m512i step = _mm512_set1_epi32(LANES);
@@ -124,17 +125,17 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few keys.
 inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
   float bound = FAR;
-  if (k <= 4 * LANES) {
-    float least[4 * LANES];
-    for (int g = 0; g < 4; ++g) {
-      vec m = load(distance + g * LANES);
-      for (int j = g * LANES + 4 * LANES; j < padded; j += 4 * LANES) {
+  if (k <= GROUPS) {
+    float least[GROUPS];
+    for (int g = 0; g < GROUPS; g += LANES) {
+      vec m = load(distance + g);
+      for (int j = g + GROUPS; j < padded; j += GROUPS) {
         const vec d = load(distance + j);
         m = d < m ? d : m;
       }
-      store(least + g * LANES, m);
+      store(least + g, m);
     }
-    std::nth_element(least, least + k - 1, least + 4 * LANES);
+    std::nth_element(least, least + k - 1, least + GROUPS);
     bound = least[k - 1];
   }
   int count = 0;
@@ -240,7 +241,7 @@ extern "C" {
 
 // points (count, dims), count > 1; queries are the first `rows` of them; out (rows, k) indices, self left out.
 void straightpcf_knn(const float* points, int count, int dims, int rows, int k, int32_t* out) {
-  const int padded = (count + 63) / 64 * 64;
+  const int padded = (count + GROUPS - 1) / GROUPS * GROUPS;
   Candidates near(padded);
 #if defined(__AMX_BF16__)
   if (dims >= MANY_DIMS) {
@@ -261,12 +262,12 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
     return;
   }
 #endif
-  std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)QUERIES * padded);
-  std::vector<float> queries((size_t)QUERIES * dims);
+  std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)ROWS * padded);
+  std::vector<float> queries((size_t)ROWS * dims);
   for (int i = 0; i < count; ++i)
     for (int d = 0; d < dims; ++d) columns[(size_t)d * padded + i] = points[(size_t)i * dims + d];
-  for (int first = 0; first < rows; first += QUERIES) {
-    const int block = std::min(QUERIES, rows - first);
+  for (int first = 0; first < rows; first += ROWS) {
+    const int block = std::min(ROWS, rows - first);
     std::memcpy(queries.data(), points + (size_t)first * dims, (size_t)block * dims * sizeof(float));
     distances(columns.data(), padded, queries.data(), dims, distance.data());
     for (int q = 0; q < block; ++q) {

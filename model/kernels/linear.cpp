@@ -50,7 +50,7 @@ void straightpcf_pack_linear(const float* weight, int width, int out_width, floa
 // to the next; `packed` is W by straightpcf_pack_linear; width and out_width are multiples of 32.
 void straightpcf_linear(const float* x, int stride, const float* packed, const float* bias, int rows, int width,
                         int out_width, int relu, float* out) {
-  std::vector<float> scratch((size_t)BLOCK * width + LANES);
+  std::vector<float> scratch((size_t)BLOCK * width + 16);
   float* block = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) / 64 * 64);
   alignas(64) float sums[BLOCK * BLOCK];
 #if defined(__AMX_BF16__)
@@ -88,18 +88,18 @@ void straightpcf_linear(const float* x, int stride, const float* packed, const f
   }
   _tile_release();
 #else
-  constexpr int ROWS = 8, COLS = BLOCK / LANES;
   for (int first = 0; first < rows; first += BLOCK) {
     const int here = std::min(BLOCK, rows - first);
     for (int n = 0; n < here; ++n)
       std::memcpy(block + (size_t)n * width, x + (size_t)(first + n) * stride, width * sizeof(float));
     for (int c0 = 0; c0 < out_width; c0 += BLOCK) {
-      for (int n = 0; n < here; n += ROWS) {
-        vec sum[ROWS][COLS];
-        products<ROWS, COLS>(block + (size_t)n * width, width, packed + (size_t)c0 * width, sum);
-        for (int r = 0; r < ROWS; ++r)
-          for (int c = 0; c < COLS; ++c) store(sums + (n + r) * BLOCK + c * LANES, sum[r][c]);
-      }
+      for (int c1 = 0; c1 < BLOCK; c1 += COLS * LANES)
+        for (int n = 0; n < here; n += ROWS) {
+          vec sum[ROWS][COLS];
+          products<ROWS, COLS>(block + (size_t)n * width, width, packed + (size_t)(c0 + c1) * width, sum);
+          for (int r = 0; r < ROWS; ++r)
+            for (int c = 0; c < COLS; ++c) store(sums + (n + r) * BLOCK + c1 + c * LANES, sum[r][c]);
+        }
       finish(sums, bias + c0, here, out_width, relu != 0, out + (size_t)first * out_width + c0);
     }
   }

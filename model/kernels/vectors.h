@@ -1,4 +1,4 @@
-// What every kernel is written in: vectors of 16 floats, which the compiler splits where registers are narrower.
+// What every kernel is written in: vectors of floats.
 #pragma once
 
 #include <algorithm>
@@ -11,14 +11,25 @@
 
 namespace {
 
-constexpr int LANES = 16;
-typedef float vec __attribute__((vector_size(64), aligned(4)));
-typedef int32_t ivec __attribute__((vector_size(64), aligned(4)));
+// Floats of a vector, as many as a register has: gcc keeps wider ones in memory. And rows, and vectors of columns, of a
+// block of sums that fits the registers beside what it is summed from.
+#if defined(__AVX512F__)
+constexpr int LANES = 16, ROWS = 8, COLS = 2;
+#elif defined(__AVX2__)
+constexpr int LANES = 8, ROWS = 4, COLS = 2;
+#elif defined(__aarch64__)
+constexpr int LANES = 4, ROWS = 8, COLS = 2;
+#else
+constexpr int LANES = 4, ROWS = 4, COLS = 2;
+#endif
+typedef float vec __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef int32_t ivec __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 
-struct alignas(64) Line { vec v; };  // never across two cache lines
+struct alignas(4 * LANES) Line { vec v; };  // never across two cache lines
 
-inline vec load(const float* p) { vec v; std::memcpy(&v, p, sizeof v); return v; }
-inline void store(float* p, vec v) { std::memcpy(p, &v, sizeof v); }
+// Not by memcpy, which gcc makes two halves of for AVX2, by way of the stack: five times as slow.
+inline vec load(const float* p) { return *reinterpret_cast<const vec*>(p); }
+inline void store(float* p, vec v) { *reinterpret_cast<vec*>(p) = v; }
 inline vec splat(float x) { return vec{} + x; }
 
 inline int32_t bits_of(float x) { int32_t bits; std::memcpy(&bits, &x, 4); return bits; }
