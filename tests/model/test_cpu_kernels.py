@@ -38,6 +38,9 @@ _EVERY = ["amx_bf16", "avx512_bf16", "avx512bw", "avx2", "generic"]
         ("AMD64", "fma avx2", "avx2", _EVERY),
         ("x86_64", "avx2 avx512bw avx512_bf16 amx_tile amx_bf16", "amx_bf16", _EVERY),
         ("x86_64", "avx2 avx512bw amx_tile amx_bf16", "avx512bw", _EVERY),  # what a hypervisor may leave
+        ("x86_64", "AuthenticAMD avx2 avx512bw avx512_bf16", "avx512_bf16", _EVERY),
+        ("x86_64", "GenuineIntel avx2 avx512bw avx512_bf16", "avx512bw", _EVERY),
+        ("x86_64", "GenuineIntel avx2 avx512bw avx512_bf16 amx_tile amx_bf16", "amx_bf16", _EVERY),
     ],
 )
 def test_a_machine_compiles_and_takes_the_kernels_of_its_architecture(
