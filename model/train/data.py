@@ -172,17 +172,20 @@ class PatchSource:
         self,
         shapes: list[list[npt.NDArray[np.float32]]],
         normals: Sequence[npt.NDArray[np.float32] | None] | None = None,
+        surfaces: Sequence[npt.NDArray[np.float32] | None] | None = None,
     ) -> None:
         """Take the clouds of each shape, in one frame; the one of most points is taken for its surface.
 
-        normals: those of the clouds of most points, (M, 3); None where they are to be computed.
+        surfaces: another cloud of each shape to be taken for that, (M, 3), or None; normals: those of the clouds that
+        are, (M, 3); None where they are to be computed.
         """
         if not shapes:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
         self.clouds: list[npt.NDArray[np.float64]] = []
         self.surfaces: list[Surface] = []
-        for shape, given in zip(shapes, normals or [None] * len(shapes), strict=True):
-            finest = max(shape, key=len).astype(np.float64)
+        unknown = [None] * len(shapes)
+        for shape, given, surface in zip(shapes, normals or unknown, surfaces or unknown, strict=True):
+            finest = (max(shape, key=len) if surface is None else surface).astype(np.float64)
             across = given.astype(np.float64) if given is not None else recompute_normals(finest, 0 * finest)
             for cloud in shape:
                 wide = cloud.astype(np.float64)
@@ -203,11 +206,11 @@ class PatchSource:
     def read(cls, *paths: Path, validation: bool = False) -> PatchSource:
         """Read the training shapes of .npz files, or the held-out ones, of each file every tenth.
 
-        Clean clouds (N, 3) are named `<shape>/<resolution>`; with them may be `<shape>/normals`, the unit normals of
-        the one of most points.
+        Clean clouds (N, 3) are named `<shape>/<resolution>`; with them may be `<shape>/surface`, a finer one from which
+        nothing is drawn, and `<shape>/normals`, the unit normals of the one of most points.
         """
         shapes: dict[tuple[Path, str], list[npt.NDArray[np.float32]]] = {}
-        normals: dict[tuple[Path, str], npt.NDArray[np.float32]] = {}
+        beside: dict[str, dict[tuple[Path, str], npt.NDArray[np.float32]]] = {"normals": {}, "surface": {}}
         for path in paths:
             with np.load(path, allow_pickle=False) as archive:
                 held_out = held_out_shapes(archive.files)
@@ -215,11 +218,12 @@ class PatchSource:
                     shape, what = name.split("/")
                     if (shape in held_out) != validation:
                         continue
-                    if what == "normals":
-                        normals[path, shape] = archive[name]
+                    if what in beside:
+                        beside[what][path, shape] = archive[name]
                     else:
                         shapes.setdefault((path, shape), []).append(archive[name])
-        return cls(list(shapes.values()), [normals.get(key) for key in shapes])
+        normals, surfaces = ([beside[what].get(key) for key in shapes] for what in ("normals", "surface"))
+        return cls(list(shapes.values()), normals, surfaces)
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""

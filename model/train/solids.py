@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -177,12 +177,16 @@ class Solid:
         return held
 
 
-def write_solids(path: Path, count: int, *, seed: int = 0) -> None:
+def write_solids(path: Path, count: int, *, seed: int = 0, resolutions: Collection[int] | None = None) -> None:
     """Write an .npz of `count` solids as PUNet's training split is written: `solid<number>/<resolution>`, float32.
 
-    With them their normals, `solid<number>/normals`, of the points at the finest resolution. All in the frame where the
-    bounding sphere has radius 1.
+    With them their normals, `solid<number>/normals`, of the points at the finest of RESOLUTIONS. All in the frame where
+    the bounding sphere has radius 1. resolutions: those of RESOLUTIONS to train on, all by default; without the finest,
+    that is `solid<number>/surface`. Raises ValueError for any other.
     """
+    wanted = RESOLUTIONS if resolutions is None else resolutions
+    if not wanted or not set(wanted) <= set(RESOLUTIONS):
+        raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, wanted))}")
     arrays = {}
     for number in range(count):
         rng = np.random.default_rng([seed, number])
@@ -192,7 +196,10 @@ def write_solids(path: Path, count: int, *, seed: int = 0) -> None:
         for resolution in RESOLUTIONS:
             some = rng.permutation(len(xyz))[: _CANDIDATES * resolution]
             kept = some[fpsample.bucket_fps_kdline_sampling(xyz[some].astype(np.float32), resolution, 7, 0)]
-            arrays[f"solid{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
+            if resolution in wanted:
+                arrays[f"solid{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
+        if resolution not in wanted:
+            arrays[f"solid{number:03d}/surface"] = xyz[kept].astype(np.float32)
         arrays[f"solid{number:03d}/normals"] = normals[kept].astype(np.float32)
     np.savez_compressed(path, **arrays)
 
@@ -365,5 +372,8 @@ if __name__ == "__main__":
     parser.add_argument("path", type=Path)
     parser.add_argument("--count", type=int, default=36)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--resolutions", type=int, nargs="+", choices=RESOLUTIONS, help="those to train on, all by default"
+    )
     options = parser.parse_args()
-    write_solids(options.path, options.count, seed=options.seed)
+    write_solids(options.path, options.count, seed=options.seed, resolutions=options.resolutions)

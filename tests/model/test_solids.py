@@ -69,6 +69,21 @@ def test_an_archive_of_solids_is_training_data(tmp_path: Path, monkeypatch: pyte
         assert np.array_equal(source.surfaces[0].normals, archive["solid000/normals"].astype(np.float64))
 
 
+def test_coarse_solids_are_drawn_from_and_the_finest_is_their_surface(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solids, "RESOLUTIONS", (2000, 5000))
+    write_solids(tmp_path / "all.npz", 1)
+    write_solids(tmp_path / "coarse.npz", 1, resolutions=[2000])
+    whole, coarse = (PatchSource.read(tmp_path / name) for name in ("all.npz", "coarse.npz"))
+    assert [len(cloud) for cloud in coarse.clouds] == [2000]
+    np.testing.assert_array_equal(coarse.clouds[0], whole.clouds[0])
+    np.testing.assert_array_equal(coarse.surfaces[0].normals, whole.surfaces[0].normals)
+    np.testing.assert_array_equal(coarse.surfaces[0].xyz, whole.surfaces[0].xyz)
+    with pytest.raises(ValueError, match="resolutions are 2000, 5000, not 3000"):
+        write_solids(tmp_path / "none.npz", 1, resolutions=[3000])
+
+
 def test_the_same_seed_gives_the_same_solids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solids, "RESOLUTIONS", (500,))
     for name in ("once", "again"):
