@@ -77,6 +77,12 @@ def test_a_module_that_learns_goes_step_by_step() -> None:
         assert not in_one_call(module.eval(), x.double())
 
 
+def test_a_module_made_in_inference_mode_goes_step_by_step() -> None:
+    with torch.inference_mode():
+        module = VelocityModule().eval()
+        assert not in_one_call(module, torch.randn(1, 50, 3))
+
+
 def test_threads_do_not_disturb_each_other() -> None:
     module = of(VelocityModule)
     patches = [torch.randn(1, count, 3) * 0.2 for count in (50, 400, 90, 300) * 8]
