@@ -76,9 +76,13 @@ def load() -> ctypes.CDLL | None:
             if path.is_file():
                 return _open(path)
         try:
-            return _open(build(_cache(), name))
+            library = _open(build(_cache(), name))
         except (OSError, subprocess.SubprocessError) as exc:
             failed = failed or exc
+            continue
+        if failed:
+            warnings.warn(f"CPU kernels compiled for {name} only, which is slower here ({failed})", stacklevel=2)
+        return library
     warnings.warn(f"CPU kernels not compiled ({failed}); plain torch is used, several times slower", stacklevel=2)
     return None
 

@@ -24,10 +24,7 @@ void straightpcf_pack(const float* weight, int width, int out_width, float* pack
           half[((size_t)c0 * width) + (size_t)d * LANES + lane * 2 + p] = uint16_t(bits >> 16);
         }
 #else
-  for (int c0 = 0; c0 < out_width; c0 += LANES)
-    for (int d = 0; d < width; ++d)
-      for (int lane = 0; lane < LANES; ++lane)
-        packed[(size_t)c0 * width + (size_t)d * LANES + lane] = weight[(size_t)(c0 + lane) * width + d];
+  pack_floats(weight, width, out_width, packed);
 #endif
 }
 
@@ -35,7 +32,7 @@ void straightpcf_pack(const float* weight, int width, int out_width, float* pack
 
 namespace {
 
-// One block of R edges by 16 C channels: products with the packed weight, then the running maximum.
+// One block of R edges by C vectors of channels: products with the packed weight, then the running maximum.
 template <int R, int C>
 inline void block(const element* hidden, int width, const element* packed, int first, vec* best, ivec* which) {
   vec sum[R][C];
@@ -46,6 +43,16 @@ inline void block(const element* hidden, int width, const element* packed, int f
       best[c] = more ? sum[r][c] : best[c];
       which[c] = more ? (ivec{} + (first + r)) : which[c];
     }
+}
+
+// The largest of a point's edges in C vectors of channels to their place, and, if asked for, which edges.
+template <int C>
+inline void finish(const vec* best, const ivec* which, float* out, uint8_t* arg) {
+  for (int c = 0; c < C; ++c) {
+    store(out + c * LANES, best[c]);
+    if (arg)
+      for (int lane = 0; lane < LANES; ++lane) arg[c * LANES + lane] = uint8_t(which[c][lane]);
+  }
 }
 
 // relu(a_i + b_j) for the edges of one point.
@@ -91,7 +98,7 @@ void edge_max_tiles(const float* a, const float* b, const int32_t* index, const 
                     int width, int out_width, float* out, uint8_t* arg) {
   const int edges = (k + 2 * TILE - 1) / (2 * TILE) * 2 * TILE;
   std::vector<uint16_t> scratch((size_t)edges * width + DEPTH);
-  uint16_t* hidden = reinterpret_cast<uint16_t*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) / 64 * 64);
+  uint16_t* hidden = aligned(scratch.data());
   alignas(64) float sums[2 * TILE * 2 * LANES];
   const uint16_t* weight = reinterpret_cast<const uint16_t*>(packed);
   configure_tiles();
@@ -106,12 +113,8 @@ void edge_max_tiles(const float* a, const float* b, const int32_t* index, const 
         store_sums(sums, 2 * LANES);
         largest(sums, first, best, which, arg != nullptr);
       }
-      for (int c = 0; c < 2; ++c) {
-        store(out + (size_t)i * out_width + c0 + c * LANES, best[c]);
-        if (arg)
-          for (int lane = 0; lane < LANES; ++lane)
-            arg[(size_t)i * out_width + c0 + c * LANES + lane] = uint8_t(which[c][lane]);
-      }
+      const size_t place = (size_t)i * out_width + c0;
+      finish<2>(best, which, out + place, arg ? arg + place : nullptr);
     }
   }
   _tile_release();
@@ -135,12 +138,8 @@ void edge_max(const float* a, const float* b, const int32_t* index, const float*
       int n = 0;
       for (; n + ROWS <= k; n += ROWS) block<ROWS, C>(hidden + (size_t)n * width, width, w, n, best, which);
       for (; n < k; ++n) block<1, C>(hidden + (size_t)n * width, width, w, n, best, which);
-      for (int c = 0; c < C; ++c) {
-        store(out + (size_t)i * out_width + c0 + c * LANES, best[c]);
-        if (arg)
-          for (int lane = 0; lane < LANES; ++lane)
-            arg[(size_t)i * out_width + c0 + c * LANES + lane] = uint8_t(which[c][lane]);
-      }
+      const size_t place = (size_t)i * out_width + c0;
+      finish<C>(best, which, out + place, arg ? arg + place : nullptr);
     }
   }
 }
@@ -163,7 +162,7 @@ void straightpcf_edge_max(const float* a, const float* b, const int32_t* index, 
 }
 
 // The gradient: only the winning edge of each (i, c) carries any. grad_b (count, width) and grad_weight are added to.
-// Sixteen hidden channels at a time: their share of all that is read in random order fits the caches.
+// A vector of hidden channels at a time: their share of all that is read in random order fits the caches.
 void straightpcf_edge_max_backward(const float* grad, const uint8_t* arg, const float* a, const float* b,
                                    const int32_t* index, const float* weight, int rows, int count, int k, int width,
                                    int out_width, float* grad_a, float* grad_b, float* grad_weight) {

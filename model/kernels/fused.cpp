@@ -15,7 +15,7 @@ class Buffers {
  public:
   explicit Buffers(size_t floats) {
     if (kept_.size() < floats + 16) kept_.resize(floats + 16);
-    next_ = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(kept_.data()) + 63) / 64 * 64);
+    next_ = aligned(kept_.data());
   }
   float* take(size_t floats) {  // a multiple of a cache line at a time keeps them aligned
     float* here = next_;

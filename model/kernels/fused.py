@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -58,12 +59,11 @@ class Fused:
         """Yield what `Block` in fused.cpp lists; parts: the widths of the inputs that lie side by side."""
         hidden, second = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
         own, other = hidden.weight.chunk(2, dim=1)
-        # The first layer runs per point, not per edge.
-        for weight, bias in ((own - other, hidden.bias), (other, torch.zeros_like(hidden.bias))):
-            yield from self._exact(weight, bias) if parts == [3] else self._layer(weight, bias, parts)
+        layer = self._exact if parts == [3] else partial(self._layer, parts=parts)
+        yield from layer(own - other, hidden.bias)  # the first layer runs per point, not per edge
+        yield from layer(other, torch.zeros_like(hidden.bias))
         yield from self._layer(second.weight, second.bias, [second.in_features], edges=True)
-        skip = block.lin
-        yield from self._exact(skip.weight, skip.bias) if parts == [3] else self._layer(skip.weight, skip.bias, parts)
+        yield from layer(block.lin.weight, block.lin.bias)
 
     def _decoder(self, decoder: Decoder) -> Iterator[torch.Tensor]:
         for lin, norm in ((decoder.lin_1, decoder.bn_1_out), (decoder.lin_2, decoder.bn_2_out)):

@@ -7,8 +7,7 @@
 namespace {
 
 constexpr float FAR = 3.4e38f;  // of padding and of the query itself: never chosen
-constexpr int GROUPS = 64;      // disjoint, of a patch filled up to a multiple of them: see `select`
-constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
+constexpr int GROUPS = 64;  // disjoint, of a patch filled up to a multiple of them: see `select`
 
 // Squared distances of ROWS queries to all points; `columns` is the patch transposed, (dims, padded).
 inline void distances(const float* columns, int padded, const float* queries, int dims, float* out) {
@@ -106,7 +105,7 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   _mm512_storeu_si512(&near.distance[count], far);
   const Threshold last = threshold(near.distance.data(), vectors, k, 0, {bound, count});
   const int32_t sure = last.reached == k ? last.bits : last.bits - 1;  // else some lie exactly there, and not all fit
-  const __m512i within = _mm512_set1_epi32(sure), tied = _mm512_set1_epi32(last.bits);
+  const __m512i within = _mm512_set1_epi32(sure);
   int taken = 0;
   for (int n = 0; n < vectors; ++n) {
     const __mmask16 chosen = _mm512_cmple_epi32_mask(_mm512_loadu_si512(&near.distance[n * LANES]), within);
@@ -140,11 +139,8 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   }
   int count = 0;
   for (int j = 0; j < padded; ++j)
-    if (distance[j] <= bound && distance[j] < FAR) {
-      uint32_t bits;
-      std::memcpy(&bits, &distance[j], 4);
-      near.keys[count++] = (uint64_t(bits) << 32) | uint32_t(j);
-    }
+    if (distance[j] <= bound && distance[j] < FAR)
+      near.keys[count++] = (uint64_t(bits_of(distance[j])) << 32) | uint32_t(j);
   const auto begin = near.keys.begin();
   if (count > k) std::nth_element(begin, begin + k, begin + count);
   else std::sort(begin, begin + count);
@@ -154,6 +150,8 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
 #endif
 
 #if defined(__AMX_BF16__)
+
+constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
 
 // Squared distances in many dimensions by products, |q|^2 + |p|^2 - 2 q p, on tiles. A coordinate is the sum of two
 // bf16, `high` and `low`, of whose products low times low is left out: 2^-16 of |q| |p|. Squares are sums of three.
@@ -203,15 +201,8 @@ class Products {
       load_rows(q + 2 * steps_ * tile, row);
       load_columns(p + 2 * steps_ * tile, row);
       multiply();
-      for (size_t step = 0; step < 2 * steps_ * tile; step += 2 * tile) {
-        load_rows(q + step + tile, row);  // low
-        load_columns(p + step, row);      // high
-        multiply();
-        load_rows(q + step, row);
-        multiply();
-        load_columns(p + step + tile, row);
-        multiply();
-      }
+      for (size_t step = 0; step < 2 * steps_ * tile; step += 2 * tile)
+        add_split_products(q + step, tile, row, p + step, tile, row);
       store_sums(out + j, stride);
     }
   }

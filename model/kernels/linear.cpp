@@ -40,9 +40,7 @@ void straightpcf_pack_linear(const float* weight, int width, int out_width, floa
       scatter_column(to + TILE * DEPTH, parts.low);
     }
 #else
-  for (int c = 0; c < out_width; ++c)
-    for (int d = 0; d < width; ++d)
-      packed[(size_t)(c / LANES) * LANES * width + (size_t)d * LANES + c % LANES] = weight[(size_t)c * width + d];
+  pack_floats(weight, width, out_width, packed);
 #endif
 }
 
@@ -51,7 +49,7 @@ void straightpcf_pack_linear(const float* weight, int width, int out_width, floa
 void straightpcf_linear(const float* x, int stride, const float* packed, const float* bias, int rows, int width,
                         int out_width, int relu, float* out) {
   std::vector<float> scratch((size_t)BLOCK * width + 16);
-  float* block = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) / 64 * 64);
+  float* block = aligned(scratch.data());
   alignas(64) float sums[BLOCK * BLOCK];
 #if defined(__AMX_BF16__)
   // Of 32 rows and 32 channels two tiles of the high parts, then two of the low ones.
@@ -74,13 +72,7 @@ void straightpcf_linear(const float* x, int stride, const float* packed, const f
       clear_sums();
       for (int d = 0; d < width; d += DEPTH) {
         const uint16_t *r = tiles + d / DEPTH * 4 * tile, *c = columns + (size_t)d / DEPTH * 2 * tile;
-        load_rows(r + 2 * tile, tile);  // low
-        load_columns(c, gap);           // high
-        multiply();
-        load_rows(r, tile);
-        multiply();
-        load_columns(c + tile, gap);
-        multiply();
+        add_split_products(r, 2 * tile, tile, c, tile, gap);
       }
       store_sums(sums, BLOCK);
       finish(sums, bias + c0, here, out_width, relu != 0, out + (size_t)first * out_width + c0);

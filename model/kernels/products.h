@@ -17,7 +17,15 @@ typedef float element;
 inline void put(element* to, vec v) { store(to, v); }
 #endif
 
-// sum[r][c] = row r of `rows` (ROWS, width) times 16 columns c of `packed`, as pack or pack_linear has laid them out.
+// W (out_width, width), so that a vector's channels lie beside each other.
+inline void pack_floats(const float* weight, int width, int out_width, float* packed) {
+  for (int c0 = 0; c0 < out_width; c0 += LANES)
+    for (int d = 0; d < width; ++d)
+      for (int lane = 0; lane < LANES; ++lane)
+        packed[(size_t)c0 * width + (size_t)d * LANES + lane] = weight[(size_t)(c0 + lane) * width + d];
+}
+
+// sum[r][c] = row r of `rows` (ROWS, width) times the vector c of columns of `packed`, which pack or pack_linear wrote.
 template <int ROWS, int COLS>
 inline void products(const float* rows, int width, const float* packed, vec sum[ROWS][COLS]) {
   vec s[ROWS][COLS];

@@ -53,6 +53,17 @@ inline void multiply() {
   _tile_dpbf16ps(2, 5, 6);
   _tile_dpbf16ps(3, 5, 7);
 }
+// The same where a number is the sum of two bfloat16: the tiles of the low parts lie behind those of the high ones.
+inline void add_split_products(const uint16_t* rows, size_t row_low, size_t row_gap, const uint16_t* columns,
+                               size_t column_low, size_t column_gap) {
+  load_rows(rows + row_low, row_gap);
+  load_columns(columns, column_gap);
+  multiply();
+  load_rows(rows, row_gap);
+  multiply();
+  load_columns(columns + column_low, column_gap);
+  multiply();
+}
 // Adds 32 rows, as tiles of 32 channels beside each other, times 32 columns packed by straightpcf_pack.
 inline void add_products(const uint16_t* rows, const uint16_t* columns, int width) {
   for (int d = 0; d < width; d += DEPTH, rows += 2 * TILE * DEPTH, columns += DEPTH * LANES) {
