@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -18,6 +18,7 @@ from straightpcf.model.tiles import Tiling
 __all__ = ["OnHost"]
 
 _T = TypeVar("_T")
+_Item = TypeVar("_Item")
 
 
 class OnHost:
@@ -55,10 +56,10 @@ class OnHost:
         """Spread tile by tile, the halo around."""
         moved = np.empty_like(here)
         for rows, own in tiling.surroundings():
-            moved[rows[:own]] = spread(here[rows], limit, workers=self._threads)[:own]
+            moved[rows[:own]] = spread(here[rows], limit, workers=self._threads, each=self._map)[:own]
         return moved
 
-    def _map(self, function: Callable[[int], _T], items: range) -> Iterator[_T]:
+    def _map(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
         """Map in order, few results waiting."""
         waiting: deque[Future[_T]] = deque()
         try:
@@ -83,6 +84,6 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _inference(function: Callable[[int], _T], item: int) -> _T:
+def _inference(function: Callable[[_Item], _T], item: _Item) -> _T:
     with torch.inference_mode():  # the mode belongs to a thread
         return function(item)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ from scipy.spatial import cKDTree
 __all__ = ["AROUND", "spread", "spread_among"]
 
 Floats = npt.NDArray[np.float64]
+Each = Callable[[Callable[[slice], None], Iterable[slice]], Iterable[None]]  # as `map`
 
 AROUND = 16  # neighbours of which the tangent plane is taken
 _ROUNDS = 2
@@ -19,53 +21,68 @@ _STEP = 0.2
 _PUSHING = 8  # neighbours
 # The length of the mean direction to a point's neighbours: 0 where they are all around, 0.64 on a straight border.
 _BORDER, _INSIDE = 0.5, 0.3
-_CHUNKS = {"cpu": 1 << 13, "cuda": 1 << 15}  # points at once: what the cache holds, what a batched product takes
+_CHUNKS = {"cpu": 1 << 12, "cuda": 1 << 15}  # points at once: what the cache holds, what a batched product takes
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def spread(xyz: Floats, limit: float, *, workers: int = 1) -> Floats:
+def spread(xyz: Floats, limit: float, *, workers: int = 1, each: Each = map) -> Floats:
     """Return how far each of the points (N, 3) goes to be farther from its nearest ones: (N, 3), along the surface.
 
     Noise moves points along a surface as far as across it, and leaves them in clumps and gaps that no clean cloud has;
     where each came from cannot be known, but that they were apart can. A weighted repulsion in the tangent plane, as in
     LOP (Lipman et al. 2007, "Parameterization-free projection for geometry reconstruction"). limit: the farthest that
-    any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay.
+    any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay. workers: threads that
+    look up neighbours; each: calls a function with chunks of the points, in any order, on threads if it has some.
     """
     _, index = cKDTree(xyz).query(xyz, k=min(AROUND, len(xyz) - 1) + 1, workers=workers)
     around = torch.from_numpy(index[:, 1:].astype(np.int32))
-    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit).numpy()
+    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit, each=each).numpy()
     return moved
 
 
-def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float) -> torch.Tensor:
+def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, each: Each = map) -> torch.Tensor:
     """Do what `spread` does for points (N, 3) float64 on any device.
 
     around: (N, k) rows of each point's nearest others, nearest first.
     """
     pushing = around[:, :_PUSHING]
-    normal, free = torch.empty_like(xyz), torch.empty_like(xyz[:, :1])
-    for some in _chunks(xyz):
+    step = _CHUNKS[xyz.device.type]
+    chunks = [slice(start, start + step) for start in range(0, len(xyz), step)]
+    normal, free, moved = torch.empty_like(xyz), torch.empty_like(xyz[:, :1]), torch.empty_like(xyz)
+
+    def look(some: slice) -> None:
         apart = xyz[around[some].long()] - xyz[some, None]  # (n, k, 3)
         one_sided = _length((apart / _length(apart).clamp(min=_TINY)).mean(dim=1))
         normal[some] = _normals(apart)
         free[some] = ((_BORDER - one_sided) / (_BORDER - _INSIDE)).clamp(0, 1)
-    moved = torch.zeros_like(xyz)
+
+    def push(here: torch.Tensor, there: torch.Tensor, some: slice) -> None:
+        away = here[some, None] - here[pushing[some].long()]
+        far = _length(away)
+        reach = far.amax(dim=1, keepdim=True).clamp(min=_TINY)
+        force = (away * (1 / far.clamp(min=_TINY) - 1 / reach)).sum(dim=1)
+        force *= _STEP * far.mean(dim=1) * free[some]
+        there[some] = here[some] + force - (force * normal[some]).sum(dim=1, keepdim=True) * normal[some]
+
+    def limited(here: torch.Tensor, some: slice) -> None:
+        far = here[some] - xyz[some]
+        moved[some] = far * (limit / _length(far).clamp(min=_TINY)).clamp(max=1)
+
+    # Nothing is done with all points at once: torch would share that among OpenMP's threads, which take twenty times
+    # as long where another process has one of the cores.
+    _all(each(look, chunks))
+    here = xyz
     for _ in range(_ROUNDS):
-        here = xyz + moved
-        for some in _chunks(xyz):
-            away = here[some, None] - here[pushing[some].long()]
-            far = _length(away)
-            reach = far.amax(dim=1, keepdim=True).clamp(min=_TINY)
-            push = (away * (1 / far.clamp(min=_TINY) - 1 / reach)).sum(dim=1)
-            push *= _STEP * far.mean(dim=1) * free[some]
-            push -= (push * normal[some]).sum(dim=1, keepdim=True) * normal[some]
-            moved[some] += push
-    return moved * (limit / _length(moved).clamp(min=_TINY)).clamp(max=1)
+        there = torch.empty_like(xyz)
+        _all(each(partial(push, here, there), chunks))
+        here = there
+    _all(each(partial(limited, here), chunks))
+    return moved
 
 
-def _chunks(xyz: torch.Tensor) -> Iterator[slice]:
-    step = _CHUNKS[xyz.device.type]
-    return (slice(start, start + step) for start in range(0, len(xyz), step))
+def _all(calls: Iterable[None]) -> None:
+    for _ in calls:
+        pass
 
 
 def _length(vectors: torch.Tensor) -> torch.Tensor:
