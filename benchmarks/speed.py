@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from straightpcf.model.patches import Patches
     from straightpcf.model.processor import Floats, Processor
 
+_T = TypeVar("_T")
 NOISE = 0.02
 SAMPLE = 16
 NEIGHBOURS = 32
@@ -101,13 +102,18 @@ class _Counting:
 
     def __init__(self, processor: Processor) -> None:
         self._processor, self.done = processor, list[tuple[int, int]]()
-        self.distances, self.spread = processor.distances, processor.spread
+        self.distances, self.spread, self.each = processor.distances, processor.spread, processor.each
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
-    ) -> Iterator[tuple[int, Floats]]:
+        self,
+        here: Floats,
+        cut: Patches,
+        scales: Floats,
+        probed: Mapping[int, float],
+        finish: Callable[[int, Floats], _T],
+    ) -> Iterator[_T]:
         self.done += [(cut.index.shape[1], int(some)) for some in cut.owned]
-        return self._processor.displacements(here, cut, scales, probed)
+        return self._processor.displacements(here, cut, scales, probed, finish)
 
 
 def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:

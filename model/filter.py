@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from straightpcf.model.outliers import FAR_OUT, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
 from straightpcf.model.restraint import made_of, reaches
+from straightpcf.model.spacing import Lie
 from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
@@ -157,7 +159,7 @@ class Filter:
         if device == "cpu":
             self.processor = OnHost(self.forward, self.distance, self.threads)
         else:
-            self.processor = OnDevice(self.forward, self.distance, device)
+            self.processor = OnDevice(self.forward, self.distance, device, threads=self.threads)
         keep_large_buffers()
 
     def forward(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
@@ -325,13 +327,9 @@ class Run:
             probed, believed = shown.probed, None
             if shown.scene and self.filter.zoom:
                 probed, believed = self._believed(here, cut, scales)
-            for patch, displacement in self.filter.processor.displacements(here, cut, scales, probed):
-                owned = cut.owned_points(patch)
-                step = displacement / scales[patch]
-                if self.filter.zoom:
-                    limit = None if believed is None else believed[patch]
-                    step, held = made_of(step, self.moved[owned], here[cut.index[patch]], lie=shown.lie, believed=limit)
-                    self.held[owned] |= held
+            made = partial(self._made, here, cut, scales, shown.lie, believed)
+            for owned, step, held in self.filter.processor.displacements(here, cut, scales, probed, made):
+                self.held[owned] |= held
                 self.moved[owned] += step
                 settled += len(owned)
                 copies = self.points.copies(owned)
@@ -340,6 +338,23 @@ class Run:
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
                 progress = (done_before + settled / len(here)) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
+
+    def _made(
+        self,
+        here: npt.NDArray[np.float64],
+        cut: Patches,
+        scales: npt.NDArray[np.float64],
+        lie: Lie,
+        believed: npt.NDArray[np.float64] | None,
+        patch: int,
+        displacement: npt.NDArray[np.float64],
+    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], bool]:
+        """Return the points that a patch owns, their step, and whether it was held back; on any thread."""
+        owned, step = cut.owned_points(patch), displacement / scales[patch]
+        if not self.filter.zoom:
+            return owned, step, False
+        limit = None if believed is None else believed[patch]
+        return owned, *made_of(step, self.moved[owned], here[cut.index[patch]], lie=lie, believed=limit)
 
     def _believed(
         self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.patches import Patches
-
-__all__ = ["INNER", "Neighbourhoods", "inner_points", "neighbourhoods", "nested_neighbourhoods"]
+__all__ = ["INNER", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods"]
 
 Floats = npt.NDArray[np.float64]
 
+_LEAST_RADIUS = 1e-12  # of a cloud in the unit ball; where points are in one place, rounding is what is left
 INNER = 1 / 3  # of a patch's points, those whose neighbours are in the patch, too
 
 
@@ -22,8 +20,8 @@ INNER = 1 / 3  # of a patch's points, those whose neighbours are in the patch, t
 class Neighbourhoods:
     """The k nearest points of each of n, themselves first.
 
-    local: (n, k, 3), from their mean; radii: (n,), how far the farthest is; axes: (n, 3, 3), columns of length 1, the
-    first the normal of the plane that fits them best; variances: (n, 3), k times those along the axes, rising.
+    local: (n, k, 3), from their mean; radii: (n,), how far the farthest is, above 0; axes: (n, 3, 3), columns of length
+    1, the first the normal of the plane that fits them best; variances: (n, 3), k times those along the axes, rising.
     """
 
     local: Floats
@@ -42,30 +40,37 @@ class Neighbourhoods:
         return along
 
 
+@dataclass(frozen=True)
+class Nearest:
+    """The k nearest points of each of n, itself first. distances: (n, k), rising; points: (n, k, 3)."""
+
+    distances: Floats
+    points: Floats
+
+    @classmethod
+    def of(cls, points: Floats, around: Floats, count: int) -> Nearest:
+        """Look up the `count` nearest of `around` (P, 3), or as many as there are, of each of its points (n, 3)."""
+        distances, index = cKDTree(around).query(points, k=np.arange(1, min(count, len(around)) + 1))
+        return cls(distances, around[index])
+
+    def first(self, count: int) -> Neighbourhoods:
+        """Return the neighbourhoods of the `count` nearest, or of as many as there are."""
+        some = self.points[:, :count]
+        local = some - some.mean(axis=1, keepdims=True)
+        variances, axes = np.linalg.eigh(local.mT @ local)
+        radii = np.maximum(self.distances[:, :count][:, -1], _LEAST_RADIUS)
+        return Neighbourhoods(local, radii, variances, axes)
+
+
 def neighbourhoods(points: Floats, around: Floats, count: int) -> Neighbourhoods:
     """Look up the `count` nearest of `around` (P, 3), or as many as there are, of each of its points (n, 3)."""
-    return next(nested_neighbourhoods(points, around, (count,)))
+    return Nearest.of(points, around, count).first(count)
 
 
-def nested_neighbourhoods(points: Floats, around: Floats, counts: Sequence[int]) -> Iterator[Neighbourhoods]:
-    """Yield what `neighbourhoods` returns for each of some counts; the nearest are looked up once."""
-    most = min(max(counts), len(around))
-    distances, nearest = cKDTree(around).query(points, k=np.arange(1, most + 1))
-    everyone = around[nearest]
-    for count in counts:
-        local = everyone[:, :count] - everyone[:, :count].mean(axis=1, keepdims=True)
-        variances, axes = np.linalg.eigh(local.mT @ local)
-        yield Neighbourhoods(local, distances[:, :count][:, -1], variances, axes)
+def inner_points(points: Floats, *, whole: bool) -> Floats:
+    """Return those points of a patch (P, 3) whose neighbours are in it, too: (n, 3), from the middle outwards.
 
-
-def inner_points(xyz: Floats, patches: Patches) -> Iterator[tuple[Floats, Floats]]:
-    """Yield patches of points (N, 3): their points (P, 3), and (n, 3) of these, from the middle outwards.
-
-    The inner ones are those whose neighbours are in the patch, too: of a cloud that is one patch all.
+    whole: whether the patch is a whole cloud; then they are all.
     """
-    size = patches.index.shape[1]
-    inner = size if len(patches.seeds) == 1 else round(INNER * size)
-    for rows in patches.index:
-        points = xyz[rows]
-        middle = np.square(points - points.mean(axis=0)).sum(axis=1)
-        yield points, points[np.argsort(middle)[:inner]]
+    middle = np.square(points - points.mean(axis=0)).sum(axis=1)
+    return points[np.argsort(middle)[: len(points) if whole else round(INNER * len(points))]]

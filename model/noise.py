@@ -83,7 +83,7 @@ class NoiseReader:
             return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
         zoom, parts, in_radii = 1.0, 1, 0.0
-        lie = Lie.of(here, probes, noise) if first is None else first.lie
+        lie = Lie.of(here, probes, noise, each=self._processor.each) if first is None else first.lie
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:

@@ -10,9 +10,11 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +22,14 @@ import torch
 
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
-from straightpcf.model.processor import Floats, Forward, cut_out
+from straightpcf.model.processor import Each, Floats, Forward, cut_out
 from straightpcf.model.spread import AROUND, spread_among
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
 
 __all__ = ["Capture", "Graphs", "OnDevice", "capture_cuda_graph"]
 
+_T = TypeVar("_T")
 # A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
 Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
 
@@ -104,16 +107,24 @@ class OnDevice:
         distances: Callable[[torch.Tensor], torch.Tensor],
         device: str,
         *,
+        threads: int = 1,
         batch: int = _BATCH,
         capture: Capture = capture_cuda_graph,
     ) -> None:
-        """Take the network's two parts; batch: patches at once, halved when memory runs out."""
+        """Take the network's two parts; batch: patches at once, halved when memory runs out; threads: of the CPU."""
         self.device, self.batch = torch.device(device), batch
         self._distances, self._graphs = distances, Graphs(forward, capture)
+        self._pool = ThreadPoolExecutor(threads)
+        self.each: Each = self._pool.map
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
-    ) -> Iterator[tuple[int, Floats]]:
+        self,
+        here: Floats,
+        cut: Patches,
+        scales: Floats,
+        probed: Mapping[int, float],
+        finish: Callable[[int, Floats], _T],
+    ) -> Iterator[_T]:
         """Do what a Processor does; while the device computes a batch, the results of the one before are read.
 
         Raises TooLarge where it has no memory for one patch.
@@ -136,9 +147,9 @@ class OnDevice:
                 continue
             first = chosen.stop
             if len(waiting) == _IN_FLIGHT:
-                yield from _read(*waiting.popleft(), cut)
+                yield from self._finished(*waiting.popleft(), cut, finish)
         for batch, result in waiting:
-            yield from _read(batch, result, cut)
+            yield from self._finished(batch, result, cut, finish)
 
     @torch.inference_mode()
     def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
@@ -174,6 +185,13 @@ class OnDevice:
     def _current(self) -> AbstractContextManager[object]:
         """Make the device torch's current one: Triton and captures work on no other."""
         return torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
+
+    def _finished(
+        self, batch: range, result: _Result, cut: Patches, finish: Callable[[int, Floats], _T]
+    ) -> Iterator[_T]:
+        moves = result.read().astype(np.float64)
+        owned = (move[: cut.owned[patch]] for patch, move in zip(batch, moves, strict=True))
+        yield from self._pool.map(finish, batch, owned)
 
     @torch.inference_mode()
     def _launch(self, points: torch.Tensor, cut: Patches, held: _Held, chosen: range) -> torch.Tensor:
@@ -226,9 +244,3 @@ class _Result:
         if self._there is not None:
             self._there.synchronize()
         return self._host.numpy()
-
-
-def _read(batch: range, result: _Result, cut: Patches) -> Iterator[tuple[int, Floats]]:
-    moves = result.read().astype(np.float64)
-    for patch, move in zip(batch, moves, strict=True):
-        yield patch, move[: cut.owned[patch]]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,26 +12,45 @@ import torch
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["Floats", "Forward", "Processor", "cut_out"]
+__all__ = ["Each", "Floats", "Forward", "Processor", "cut_out"]
 
+_T = TypeVar("_T")
+_Item = TypeVar("_Item")
 Floats = npt.NDArray[np.float64]
 # x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
 Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch.Tensor]
+
+
+class Each(Protocol):
+    """What calls a function with each of some items: `map`, or that on threads."""
+
+    def __call__(self, function: Callable[[_Item], _T], items: Iterable[_Item], /) -> Iterable[_T]:
+        """Yield what the calls return, in the items' order; they are made in any."""
 
 
 class Processor(Protocol):
     """Where patches are evaluated. here: (N, 3) positions in the unit ball; scales: (M,), one for each patch of cut."""
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
-    ) -> Iterator[tuple[int, Floats]]:
-        """Yield patch after patch, by number, how far the points that it owns move, in its own scale.
+        self,
+        here: Floats,
+        cut: Patches,
+        scales: Floats,
+        probed: Mapping[int, float],
+        finish: Callable[[int, Floats], _T],
+    ) -> Iterator[_T]:
+        """Yield patch after patch what `finish` returns of its number and of how far its points move, in its own scale.
 
-        probed: what the DistanceModule said of patches before, by number.
+        The points that it owns, (owned, 3). probed: what the DistanceModule said of patches before, by number. finish
+        is called on threads, in any order.
         """
 
     def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
+
+    @property
+    def each(self) -> Each:
+        """Calls on threads of the CPU."""
 
     def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
         """Return what `model.spread.spread` does; tiling: of the pass before."""

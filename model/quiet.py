@@ -7,16 +7,16 @@ two apart, as long as noise does not tilt it (docs/training.md, "Little noise").
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.neighbourhoods import inner_points, neighbourhoods
-from straightpcf.model.patches import Patches
+from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods
 
-__all__ = ["quietness", "tempered"]
+__all__ = ["noise_in_neighbourhoods", "quietness", "tempered"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -31,7 +31,6 @@ _QUIET, _LOUD = 0.05, 0.08
 # with more noise than the others.
 _OUT, _TAKEN_BACK = 6.0, 0.6
 _LEAST_OF_OTHERS = 0.1  # of a point's residual, what the fit to itself has left
-_SAMPLES = 64  # points of a patch of which a cloud's quietness is taken
 
 
 @dataclass(frozen=True)
@@ -48,15 +47,18 @@ class _Surfaces:
     normals: Floats
 
 
-def quietness(xyz: Floats, patches: Patches) -> float:
-    """Say how little noise points (N, 3) have beside their distances, 0 to 1; patches: some of them, of which half say.
+def noise_in_neighbourhoods(near: Nearest) -> float:
+    """Return the noise of points of a patch, in radii of their neighbourhoods."""
+    here = _surfaces(near.first(_AROUND))
+    return float(np.quantile(here.stds / here.radii, _SHARE))
 
-    1: a surface fitted to neighbours reads the noise well. 0: noise hides it.
+
+def quietness(ratios: Sequence[float]) -> float:
+    """Say how little noise a cloud has beside the distances of its points, 0 to 1.
+
+    1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: as of `noise_in_neighbourhoods`,
+    for each of some patches, of which half say.
     """
-    ratios = []
-    for points, inner in inner_points(xyz, patches):
-        here = _surfaces(inner[:: max(1, len(inner) // _SAMPLES)], points)
-        ratios.append(np.quantile(here.stds / here.radii, _SHARE))
     return float(np.clip((_LOUD - np.median(ratios)) / (_LOUD - _QUIET), 0.0, 1.0))
 
 
@@ -67,7 +69,7 @@ def tempered(step: Floats, around: Floats, quiet: float) -> Floats:
     n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent of the noise.
     """
     points = around[: len(step)]
-    here = _surfaces(points, around)
+    here = _surfaces(neighbourhoods(points, around, _AROUND))
     rise = (step * here.normals).sum(axis=1)
     _, place = cKDTree(points).query(points, k=np.arange(1, min(_PLACE, len(points)) + 1))
     noise = np.quantile(here.stds[place], _SHARE, axis=1)
@@ -78,9 +80,8 @@ def tempered(step: Floats, around: Floats, quiet: float) -> Floats:
     return less
 
 
-def _surfaces(points: Floats, around: Floats) -> _Surfaces:
-    """Fit heights of second order over the plane of their neighbours to points (n, 3) and those of `around` (P, 3)."""
-    near = neighbourhoods(points, around, _AROUND)
+def _surfaces(near: Neighbourhoods) -> _Surfaces:
+    """Fit heights of second order over their planes to neighbourhoods."""
     height, x, y = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     products = terms.mT @ terms + _RIDGE * np.eye(_TERMS)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial import cKDTree
 
-__all__ = ["AROUND", "spread", "spread_among"]
+from straightpcf.model.processor import Each, Floats
 
-Floats = npt.NDArray[np.float64]
-Each = Callable[[Callable[[slice], None], Iterable[slice]], Iterable[None]]  # as `map`
+__all__ = ["AROUND", "spread", "spread_among"]
 
 AROUND = 16  # neighbours of which the tangent plane is taken
 _ROUNDS = 2

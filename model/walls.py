@@ -6,15 +6,15 @@ nothing moves (docs/training.md, "Two walls or one").
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.neighbourhoods import INNER, Neighbourhoods, inner_points, nested_neighbourhoods
-from straightpcf.model.patches import Patches
+from straightpcf.model.neighbourhoods import INNER, Nearest, Neighbourhoods
 
-__all__ = ["has_walls", "share_between_walls"]
+__all__ = ["between_walls", "has_walls", "share_between_walls"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -68,13 +68,13 @@ class _Heights:
         return float(np.clip(1.0 - (np.sqrt(np.square(rise).mean()) / most - 1.0) / _RAMP, 0.0, 1.0))
 
 
-def has_walls(xyz: Floats, patches: Patches) -> bool:
-    """Say whether points (N, 3) may have walls close together; patches: some of them."""
-    found = []
-    for points, inner in inner_points(xyz, patches):
-        some = inner[:: max(1, len(inner) // _SAMPLES)]
-        nested = nested_neighbourhoods(some, points, _AROUND)
-        found.append([_Heights.of(near).are_walls(_MAY_BE_FEW) for near in nested])
+def between_walls(near: Nearest) -> list[bool]:
+    """Say whether points of a patch may be on walls close together, by their 24 and by their 64 nearest."""
+    return [_Heights.of(near.first(count)).are_walls(_MAY_BE_FEW) for count in _AROUND]
+
+
+def has_walls(found: Sequence[Sequence[bool]]) -> bool:
+    """Say whether a cloud may have walls close together; found: of its patches, or some, as of `between_walls`."""
     return bool(np.mean(found, axis=0).max() > _SOME)
 
 
@@ -86,5 +86,5 @@ def share_between_walls(step: Floats, around: Floats) -> float:
     looked_at = np.arange(0, max(len(step), round(INNER * len(around))))
     looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
     some, their_step = around[looked_at], step[looked_at[looked_at < len(step)]]
-    nested = nested_neighbourhoods(some, around, _AROUND)
-    return min(_Heights.of(near).share_left(their_step) for near in nested)
+    near = Nearest.of(some, around, max(_AROUND))
+    return min(_Heights.of(near.first(count)).share_left(their_step) for count in _AROUND)

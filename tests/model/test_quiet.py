@@ -8,12 +8,13 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.quiet import quietness, tempered
+from straightpcf.model.quiet import tempered
+from straightpcf.model.spacing import Lie
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 
 def quiet(xyz: np.ndarray) -> float:
-    return quietness(xyz, cut_patches(xyz, coverage=3.0, seed=0))
+    return Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).quiet
 
 
 @pytest.mark.parametrize("cloud", [sphere, even_sphere])

@@ -8,13 +8,13 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.spacing import is_scattered
+from straightpcf.model.spacing import Lie
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 
 def scattered(xyz: np.ndarray, noise_std: float) -> bool:
     rough = noisy(xyz, noise_std)
-    return is_scattered(rough, cut_patches(rough, coverage=3.0, seed=0), noise_std)
+    return Lie.of(rough, cut_patches(rough, coverage=3.0, seed=0), noise_std).scattered
 
 
 @pytest.mark.parametrize("count", [1000, 3000, 12_000])
@@ -42,7 +42,7 @@ def test_where_nothing_tells_points_are_taken_for_even() -> None:
 
 def test_as_many_points_in_one_place_are_no_error() -> None:
     xyz = np.repeat(sphere(100), 20, axis=0)
-    assert is_scattered(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0) in (True, False)
+    assert Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).scattered in (True, False)
 
 
 @pytest.mark.parametrize(("noise_std", "at_most"), [(0.0, 5e-6), (0.002, 2.2e-5), (0.01, 4e-4)])

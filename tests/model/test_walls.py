@@ -8,7 +8,8 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.walls import has_walls, share_between_walls
+from straightpcf.model.spacing import Lie
+from straightpcf.model.walls import share_between_walls
 from tests.clouds import even_sphere, noisy, sphere
 
 
@@ -20,7 +21,7 @@ def plate(count: int, gap: float, seed: int = 0) -> np.ndarray:
 
 
 def walls(xyz: np.ndarray) -> bool:
-    return has_walls(xyz, cut_patches(xyz, coverage=3.0, seed=0))
+    return Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).walls
 
 
 @pytest.mark.parametrize("noise_std", [0.0, 0.008])
