@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import uvicorn
 from fastapi import Depends, FastAPI
+from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 
 import straightpcf
@@ -32,7 +33,7 @@ from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
-from straightpcf.service.web import install_page
+from straightpcf.service.web import ASSET_PREFIX, install_page
 
 if TYPE_CHECKING:
     from straightpcf.service.api.grpc import GrpcServer
@@ -63,7 +64,9 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
                 await grpc.stop(patience_seconds=engine.patience_seconds)
             await engine.stop()
 
-    app = FastAPI(
+    app = FastAPIOffline(  # /docs has its scripts here: many servers have no way out
+        redoc_url=None,  # would ask its maker's server for a picture
+        favicon_url=f"{ASSET_PREFIX}icon.svg",
         title="StraightPCF",
         version=straightpcf.__version__,
         summary="Hand it a noisy point cloud, get the same points back on the surface.",

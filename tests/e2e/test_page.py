@@ -74,6 +74,17 @@ def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path
     assert 0 < np.abs(clean.xyz - noisy_.xyz).max() < 0.2
 
 
+def test_the_api_is_documented_without_a_way_out(page: Any, server: RunningServer) -> None:
+    elsewhere: list[str] = []
+    page.on(
+        "request",
+        lambda asked: None if asked.url.startswith((server.url, "data:", "blob:")) else elsewhere.append(asked.url),
+    )
+    page.goto(f"{server.url}/docs")
+    page.wait_for_selector("text=/denoise >> nth=0")
+    assert not elsewhere
+
+
 def test_a_broken_file_is_explained_and_the_page_goes_on(page: Any, scan: Path, tmp_path: Path) -> None:
     (broken := tmp_path / "broken.ply").write_bytes(scan.read_bytes()[:-50])
     page.set_input_files("#file", broken)
