@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile
+from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.positions import AXES, narrowed, put_positions, widened
 
 __all__ = ["Kitti"]
 
 ROW_BYTES = 16
+_MOST_LOST = 1e-4  # of the cloud's extent, by rounding; a frame's own is 1e-7, a town's in UTM coordinates 1e-3
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,25 @@ class Kitti(Format):
             return
         table = np.zeros((len(cloud), 4), "<f4")
         table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
+        _check_rounding(cloud.xyz, table[:, :3])
         intensity = cloud.attributes.get("intensity")
         if intensity is not None and intensity.ndim == 1 and intensity.dtype.kind in "biuf":
             with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
                 wide = intensity.astype(np.float64)
             table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
         path.write_bytes(table.tobytes())
+
+
+def _check_rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[np.float32]) -> None:
+    """Refuse positions (N, 3) that lie so far out beside their extent that float32 tells neighbours no more apart."""
+    finite = np.isfinite(xyz).all(axis=1)
+    if not finite.any():
+        return
+    here = xyz[finite]
+    half = float((here.max(axis=0) / 2 - here.min(axis=0) / 2).max())  # halves: a difference may overflow
+    lost = float(np.abs(stored[finite] - here).max())
+    if lost / 2 > _MOST_LOST * half:
+        raise UnsupportedCloud(
+            f"rounded to float32, as a KITTI frame has them, positions would be up to {lost:.3g} off, more than "
+            f"{_MOST_LOST:g} of the cloud's extent ({2 * half:.6g}): take another format, or move it to its origin"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,3 +65,13 @@ def test_a_position_that_float32_cannot_hold_is_named(frame: Path) -> None:
     with pytest.raises(UnsupportedCloud, match=r"1e\+39 does not fit into float32"):
         write_cloud(cloud.with_xyz(np.full_like(cloud.xyz, 1e39)), frame, format)
     assert frame.stat().st_size == 16 * N
+
+
+def test_what_float32_would_blur_is_refused_as_a_frame(frame: Path) -> None:
+    cloud, format = read_cloud(frame)
+    foreign = replace(cloud, source=None)
+    write_cloud(foreign, out := frame.with_name("out.bin"), format)
+    assert out.stat().st_size == 16 * N
+    town = foreign.with_xyz(foreign.xyz * 100 + [691_000.0, 5_334_000.0, 520.0])
+    with pytest.raises(UnsupportedCloud, match=r"rounded to float32.* up to 0\.25 off.*: take another format"):
+        write_cloud(town, out, format)
