@@ -49,7 +49,7 @@ _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along
 
 @dataclass(frozen=True)
 class FinishedPatch:
-    """Points whose position in this pass is settled: no other patch of the pass changes them.
+    """Points whose position in this pass is settled: no other patch of the pass changes them. There may be none.
 
     indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
     final: whether this is known to be the last pass, which `auto` finds out only afterwards;
@@ -320,9 +320,11 @@ class Run:
 
     def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
-        settled, shown = 0, self.readings[-1]
+        shown = self.readings[-1]
+        settled, whole = 0, len(shown.parts) * len(here)
+        steps = [np.zeros_like(here) for _ in shown.parts[1:]]  # all but the last, which is settled as it comes
         # The patches are cut from `here`, so results may be written into self.moved as they come.
-        for cut in self._cuts(here, tiling, shown.parts):
+        for number, cut in self._cuts(here, tiling, shown.parts):
             scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
             probed, believed = shown.probed, None
             if shown.scene and self.filter.zoom:
@@ -330,13 +332,16 @@ class Run:
             made = partial(self._made, here, cut, scales, shown.lie, believed)
             for owned, step, held in self.filter.processor.displacements(here, cut, scales, probed, made):
                 self.held[owned] |= held
-                self.moved[owned] += step
                 settled += len(owned)
+                if number < len(steps):
+                    steps[number][owned], owned = step, owned[:0]
+                else:
+                    self.moved[owned] += np.mean([step, *(other[owned] for other in steps)], axis=0)
                 copies = self.points.copies(owned)
                 indices = self.rows[copies]
                 moved = self.moved[self.points.inverse[copies]]
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
-                progress = (done_before + settled / len(here)) * share
+                progress = (done_before + settled / whole) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
 
     def _made(
@@ -364,14 +369,16 @@ class Run:
         noise = self.reader.noise_stds(distances, scales)
         return dict(enumerate(distances.tolist())), reaches(here, cut, noise, self.readings[0].usual)
 
-    def _cuts(self, here: npt.NDArray[np.float64], tiling: Tiling, parts: int) -> Iterator[Patches]:
-        """Cut a pass: the whole cloud, or part after part."""
-        if parts == 1:
-            yield from tiling.cuts()
-            return
-        for rows in parted(here, tiling.tiles, parts):
-            for cut in self._tiling(here[rows]).cuts():
-                yield cut.of_rows(rows)
+    def _cuts(
+        self, here: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]
+    ) -> Iterator[tuple[int, Patches]]:
+        """Cut a pass once for each of some numbers of parts: the whole cloud, or part after part."""
+        for number, count in enumerate(parts):
+            if count == 1:
+                yield from ((number, cut) for cut in tiling.cuts())
+                continue
+            for rows in parted(here, tiling.tiles, count):
+                yield from ((number, cut.of_rows(rows)) for cut in self._tiling(here[rows]).cuts())
 
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
         owner = self.filter

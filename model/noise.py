@@ -38,11 +38,11 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; lie: how its points lie, before the first pass; zoom: the factor by
-    which the pass shows an object larger; parts: in how many it filters it; noise_in_radii: an object's noise std in
-    radii of its patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what
-    the DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's
-    points have, or less.
+    object seen whole; lie: how its points lie, before the first pass; zoom: the factor by which the pass shows an
+    object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
+    patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what the
+    DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's points
+    have, or less.
     """
 
     distance: float
@@ -50,7 +50,7 @@ class Reading:
     scene: bool
     lie: Lie
     zoom: float = 1.0
-    parts: int = 1
+    parts: tuple[int, ...] = (1,)
     noise_in_radii: float = 0.0
     probed: Mapping[int, float] = field(default_factory=dict)
     usual: float = 0.0
@@ -79,10 +79,10 @@ class NoiseReader:
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         if scene:
             noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
-            probed = known if parts == 1 else {}
+            probed = known if parts == (1,) else {}
             return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
-        zoom, parts, in_radii = 1.0, 1, 0.0
+        zoom, parts, in_radii = 1.0, (1,), 0.0
         lie = Lie.of(here, probes, noise, each=self._processor.each) if first is None else first.lie
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
@@ -92,12 +92,12 @@ class NoiseReader:
                 zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
             elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
                 zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
-        if parts > 1:  # of other patches
+        if parts != (1,):  # of other patches
             return Reading(distance, noise, scene, lie, zoom, parts, in_radii)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, lie, zoom, 1, in_radii, known)
+        return Reading(distance, noise, scene, lie, zoom, parts, in_radii, known)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
@@ -117,11 +117,11 @@ class NoiseReader:
 
     def _read_scene(
         self, here: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, *, first: bool
-    ) -> tuple[float, float, int]:
+    ) -> tuple[float, float, tuple[int, ...]]:
         """Return the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
         noise, usual = self._noise_of_scene(probes, distances, scales)
         if np.isfinite(usual) or not (first and self._zoom):
-            return noise, usual, 1
+            return noise, usual, (1,)
         noise, usual = self._read_scene_again(here, tiling, noise)
         return noise, usual, parts_of(noise, probes.radii, len(here))
 

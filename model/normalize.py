@@ -31,8 +31,8 @@ _BEARABLE_NOISE = 0.044  # more is brought to this, below the least factor, too
 LOUD_NOISE = 0.036
 _WAVY, _SHOWN_REST, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
 _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
-# Of noise, in radii of a patch, for each part: see `parts_of`.
-_NOISE_A_PART = 0.062
+# Of noise, in radii of a patch, for each part, and the range of these in which both 1 and 2 do: see `parts_of`.
+_NOISE_A_PART, _BOTH = 0.062, (1.25, 1.75)
 _MOST_PARTS, _SMALLEST_PART = 6, 2000
 _BLOCK = 2**16  # rows whose distances are held at once
 
@@ -105,15 +105,21 @@ def noise_in_radii(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
     return noise_std / max(float(np.median(radii)), 1e-9)
 
 
-def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> int:
-    """Return in how many parts a pass filters `count` points, each by itself: 1 where patches reach far enough.
+def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tuple[int, ...]:
+    """Return in how many parts a pass filters `count` points, each by itself: (1,) where patches reach far enough.
+
+    (1, 2): as a whole and in two parts, and takes the mean of both, which on the border between the two is better than
+    either: where one takes walls for noise, the other does not, and the other way round.
 
     noise_std, radii: in the unit ball, radii of some patches of the whole cloud. A patch is the 1000 nearest points,
     however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
     has patches of sqrt(m) times the radius, at the same cost (docs/training.md, "Parts").
     """
-    wanted = round(noise_in_radii(noise_std, radii) / _NOISE_A_PART)
-    return max(1, min(wanted, _MOST_PARTS, count // _SMALLEST_PART))
+    wanted = noise_in_radii(noise_std, radii) / _NOISE_A_PART
+    most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
+    if _BOTH[0] <= wanted < _BOTH[1] and most > 1:
+        return (1, 2)
+    return (max(1, min(round(wanted), most)),)
 
 
 def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1.0) -> npt.NDArray[np.float64]:

@@ -56,7 +56,7 @@ def denoise_file(
             patches.write(encode_header(len(cloud)))
         preview = _Preview(len(cloud), on_preview)
         for patch in run.patches():
-            if patches is not None:
+            if patches is not None and len(patch.indices):
                 patches.write(
                     encode_frame(patch.indices, patch.xyz, iteration=patch.iteration, final=patch.final,
                                  progress=patch.progress)

@@ -218,7 +218,7 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
     cloud = noisy(strip, 0.03)
     wanted: list[int] = []
 
-    def parts(*given: Any) -> int:
+    def parts(*given: Any) -> tuple[int, ...]:
         wanted.append(parts_of(*given))
         return wanted[-1]
 
@@ -227,16 +227,17 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
     for patch in shipped.patches(cloud, ONE_PASS):
         filtered[patch.indices] = patch.xyz
         seen.append(patch.indices)
-    assert wanted[0] > 1
+    assert wanted[0][-1] > 1
     assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(cloud)))
     before, after = (np.square(xyz[:, 2]).mean() for xyz in (cloud, filtered))
     assert after < 0.4 * before
 
 
+@pytest.mark.parametrize("parts", [(3,), (1, 2)])
 def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
-    tiny: Filter, monkeypatch: pytest.MonkeyPatch
+    tiny: Filter, monkeypatch: pytest.MonkeyPatch, parts: tuple[int, ...]
 ) -> None:
-    monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_: 3)
+    monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_: parts)
     cloud = noisy(torus(33_000), 0.01)
     options = DenoiseOptions(iterations=1)
     results = [
@@ -245,6 +246,20 @@ def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
     ]
     assert results[0].xyz.tobytes() == results[1].xyz.tobytes()
     assert not np.array_equal(results[0].xyz, cloud)
+
+
+def test_as_a_whole_and_in_parts_is_the_mean_of_both(tiny: Filter, monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud, results = noisy(torus(5000), 0.02), []
+    for parts in ((1,), (2,), (1, 2)):
+        monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_, parts=parts: parts)
+        patches = list(tiny.patches(cloud, ONE_PASS))
+        assert np.array_equal(np.sort(np.concatenate([patch.indices for patch in patches])), np.arange(len(cloud)))
+        progress = [patch.progress for patch in patches]
+        assert progress == sorted(progress)
+        assert progress[-1] == 1.0
+        results.append(tiny.denoise(cloud, ONE_PASS).xyz)
+    np.testing.assert_allclose(results[2], (results[0] + results[1]) / 2, atol=1e-12)
+    assert not np.allclose(results[0], results[1])
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
