@@ -30,7 +30,7 @@ from benchmarks.shapes import Shape, analytic, make_noise, punet
 
 if TYPE_CHECKING:
     from straightpcf.model.patches import Patches
-    from straightpcf.model.processor import Floats, Processor
+    from straightpcf.model.processor import Finish, Floats, Processor
 
 _T = TypeVar("_T")
 NOISE = 0.02
@@ -105,12 +105,7 @@ class _Counting:
         self.distances, self.spread, self.each = processor.distances, processor.spread, processor.each
 
     def displacements(
-        self,
-        here: Floats,
-        cut: Patches,
-        scales: Floats,
-        probed: Mapping[int, float],
-        finish: Callable[[int, Floats], _T],
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         self.done += [(cut.index.shape[1], int(some)) for some in cut.owned]
         return self._processor.displacements(here, cut, scales, probed, finish)

@@ -22,7 +22,7 @@ import torch
 
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
-from straightpcf.model.processor import Each, Floats, Forward, cut_out
+from straightpcf.model.processor import Each, Finish, Floats, Forward, cut_out
 from straightpcf.model.spread import AROUND, spread_among
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
@@ -118,12 +118,7 @@ class OnDevice:
         self.each: Each = self._pool.map
 
     def displacements(
-        self,
-        here: Floats,
-        cut: Patches,
-        scales: Floats,
-        probed: Mapping[int, float],
-        finish: Callable[[int, Floats], _T],
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Do what a Processor does; while the device computes a batch, the results of the one before are read.
 
@@ -186,9 +181,7 @@ class OnDevice:
         """Make the device torch's current one: Triton and captures work on no other."""
         return torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
 
-    def _finished(
-        self, batch: range, result: _Result, cut: Patches, finish: Callable[[int, Floats], _T]
-    ) -> Iterator[_T]:
+    def _finished(self, batch: range, result: _Result, cut: Patches, finish: Finish[_T]) -> Iterator[_T]:
         moves = result.read().astype(np.float64)
         owned = (move[: cut.owned[patch]] for patch, move in zip(batch, moves, strict=True))
         yield from self._pool.map(finish, batch, owned)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from straightpcf.model.patches import Patches
-from straightpcf.model.processor import Floats, Forward, cut_out
+from straightpcf.model.processor import Finish, Floats, Forward, cut_out
 from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling
 
@@ -29,12 +29,7 @@ class OnHost:
         self._pool = ThreadPoolExecutor(threads, initializer=_one_thread)
 
     def displacements(
-        self,
-        here: Floats,
-        cut: Patches,
-        scales: Floats,
-        probed: Mapping[int, float],
-        finish: Callable[[int, Floats], _T],
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Evaluate few patches ahead, so that a slow reader does not fill the memory."""
         points = torch.from_numpy(here)

@@ -12,13 +12,14 @@ import torch
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["Each", "Floats", "Forward", "Processor", "cut_out"]
+__all__ = ["Each", "Finish", "Floats", "Forward", "Processor", "cut_out"]
 
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
 Floats = npt.NDArray[np.float64]
 # x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
 Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch.Tensor]
+Finish = Callable[[int, Floats], _T]  # a patch's number and how far its points move -> what is made of it
 
 
 class Each(Protocol):
@@ -32,12 +33,7 @@ class Processor(Protocol):
     """Where patches are evaluated. here: (N, 3) positions in the unit ball; scales: (M,), one for each patch of cut."""
 
     def displacements(
-        self,
-        here: Floats,
-        cut: Patches,
-        scales: Floats,
-        probed: Mapping[int, float],
-        finish: Callable[[int, Floats], _T],
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Yield patch after patch what `finish` returns of its number and of how far its points move, in its own scale.
 

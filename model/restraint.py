@@ -90,7 +90,7 @@ def across(step: npt.NDArray[np.float64], around: npt.NDArray[np.float64]) -> np
     """Return a step (n, 3) without what goes along the surface, where there is one.
 
     around: (P, 3), a patch, of which the first n points make the step. Points that lie evenly are spread so again
-    (`spread`); others lie as beams or chance have it (`is_scattered`): to draw them together widens gaps and tears scan
+    (`spread`); others lie as beams or chance have it (`Lie`): to draw them together widens gaps and tears scan
     lines, and to spread them takes them away from where they were.
     """
     near = neighbourhoods(around[: len(step)], around, _AROUND)

@@ -21,9 +21,8 @@ def in_the_air(count: int, reach: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("reach", [1.3, 4.0, 1000.0])
-@pytest.mark.parametrize(
-    "noise_std", [0.004, 0.01]
-)  # between them a last bit decides whether `auto` polishes this torus
+# Between these levels of noise a last bit decides whether `auto` polishes this torus.
+@pytest.mark.parametrize("noise_std", [0.004, 0.01])
 def test_a_hundredth_of_points_in_the_air_changes_little_for_the_others(
     shipped: Filter, noise_std: float, reach: float
 ) -> None:
