@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import signal
-import socket
-import subprocess
-import threading
-import time
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import httpx2
 import numpy as np
@@ -22,54 +16,7 @@ from straightpcf.points.errors import ERRORS_BY_CODE
 from straightpcf.service.api.errors import STATUS_BY_CODE
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
-from tests.waiting import wait_for
-
-POINTS = 400
-
-
-class Answer(NamedTuple):
-    status: int
-    headers: dict[str, str]
-    body: bytes
-
-    def problem(self) -> dict[str, Any]:
-        assert self.headers["content-type"] == "application/problem+json"
-        problem: dict[str, Any] = json.loads(self.body)
-        assert set(problem) == {"type", "title", "status", "detail", "code", "retryable", "request_id"}
-        assert problem["status"] == self.status
-        assert problem["request_id"] == self.headers["x-request-id"]
-        assert problem["code"] in ERRORS_BY_CODE
-        return problem
-
-
-def curl(*arguments: str | Path, stdin: bytes = b"") -> Answer:
-    command = ["curl", "-s", "-i", "--max-time", "60", *map(str, arguments)]
-    output = subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
-    head, body = output.split(b"\r\n\r\n", 1)
-    while b" 100 " in head.split(b"\r\n", 1)[0]:
-        head, body = body.split(b"\r\n\r\n", 1)
-    status, *lines = head.decode("latin-1").split("\r\n")
-    return Answer(int(status.split()[1]), {k.lower(): v for k, v in (line.split(": ", 1) for line in lines)}, body)
-
-
-@pytest.fixture(scope="module")
-def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("clouds") / "torus.npy"
-    np.save(path, noisy(torus(POINTS), 0.01).astype(np.float32))
-    return path
-
-
-@pytest.fixture(scope="module")
-def large_cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cloud that takes a worker many seconds."""
-    path = tmp_path_factory.mktemp("clouds") / "large.npy"
-    np.save(path, noisy(sphere(40_000), 0.01))
-    return path
-
-
-def load(answer: Answer) -> np.ndarray[Any, Any]:
-    assert answer.status == 200, answer.body
-    return np.asarray(np.load(io.BytesIO(answer.body)))
+from tests.service.rest import POINTS, curl, load, npy, raw
 
 
 def test_a_form_a_raw_post_a_put_and_a_chunked_body_give_the_same_bytes(server: RunningServer, cloud: Path) -> None:
@@ -128,11 +75,6 @@ def test_rows_that_are_not_finite_pass_through(server: RunningServer, tmp_path: 
     np.testing.assert_array_equal(load(answer)[[3, 399]], xyz[[3, 399]])
 
 
-def _npy(xyz: np.ndarray[Any, Any]) -> bytes:
-    np.save(buffer := io.BytesIO(), xyz)
-    return buffer.getvalue()
-
-
 def _zip_bomb() -> bytes:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (20_000_000, 3)})
@@ -147,6 +89,8 @@ def _zip_bomb() -> bytes:
 
 
 _PLY = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
 BAD_BODIES = {
     "empty": ("scan.ply", b"", {"malformed_file", "unknown_format"}),
     "empty without a name": (None, b"", {"malformed_file", "unknown_format"}),
@@ -155,16 +99,16 @@ BAD_BODIES = {
     "truncated binary": ("scan.ply", _PLY % (b"binary_little_endian", 500) + bytes(700), {"malformed_file"}),
     "truncated ascii": ("scan.ply", _PLY % (b"ascii", 500) + b"0 0 0\n" * 20, {"malformed_file"}),
     "zero points": ("scan.ply", _PLY % (b"ascii", 0), {"too_few_points", "malformed_file"}),
-    "one point": ("one.npy", _npy(np.zeros((1, 3))), {"too_few_points"}),
-    "10 points": ("ten.npy", _npy(sphere(10)), {"too_few_points"}),
-    "all NaN": ("nan.npy", _npy(np.full((500, 3), np.nan)), {"too_few_points"}),
+    "one point": ("one.npy", npy(np.zeros((1, 3))), {"too_few_points"}),
+    "10 points": ("ten.npy", npy(sphere(10)), {"too_few_points"}),
+    "all NaN": ("nan.npy", npy(np.full((500, 3), np.nan)), {"too_few_points"}),
     "1e9 vertices": (
         "scan.ply",
         _PLY % (b"binary_little_endian", 10**9) + bytes(1200),
         {"too_many_points", "malformed_file"},
     ),
     "4e9 vertices": ("scan.ply", _PLY % (b"ascii", 4 * 10**9) + b"0 0 0\n", {"too_many_points", "malformed_file"}),
-    "pickle in npy": ("evil.npy", _npy(np.array([{}, None], dtype=object)), {"malformed_file", "unsupported_cloud"}),
+    "pickle in npy": ("evil.npy", npy(np.array([{}, None], dtype=object)), {"malformed_file", "unsupported_cloud"}),
     "zip bomb": ("bomb.npz", _zip_bomb(), {"too_many_points", "malformed_file", "too_large"}),
 }
 
@@ -191,12 +135,12 @@ def test_a_bad_file_is_a_problem_with_its_code_and_the_server_goes_on(
     ids=["all equal", "tiny", "far"],
 )
 def test_an_odd_cloud_is_denoised_to_finite_points(server: RunningServer, xyz: Any) -> None:
-    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=_npy(xyz))
+    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=npy(xyz))
     assert np.isfinite(load(answer)).all()
 
 
 def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningServer) -> None:
-    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=_npy(sphere(200) * 1e300))
+    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=npy(sphere(200) * 1e300))
     if answer.status == 200:
         assert np.isfinite(load(answer)).all()
     else:
@@ -215,7 +159,7 @@ def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningSe
 )
 def test_a_bad_option_is_refused_before_the_body_is_read(server: RunningServer, query: str, word: str) -> None:
     request = f"POST /denoise?{query} HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
-    problem = _raw(server, request.encode()).problem()
+    problem = raw(server, request.encode()).problem()
     assert problem["code"] == "invalid_options"
     assert word in problem["detail"]
 
@@ -303,129 +247,6 @@ def test_a_form_part_may_say_its_name_in_the_extended_way(server: RunningServer,
     assert answer.headers["content-disposition"] == "attachment; filename*=utf-8''%E2%98%83_clean.npy"
 
 
-def _raw(server: RunningServer, request: bytes) -> Answer:
-    """Send these bytes and nothing more; read until the server is done."""
-    host, port = server.url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=20) as connection:
-        connection.sendall(request)
-        data = b""
-        while b"\r\n\r\n" not in data or len(data.split(b"\r\n\r\n", 1)[1]) < _content_length(data):
-            received = connection.recv(65536)
-            if not received:
-                break
-            data += received
-    head, body = data.split(b"\r\n\r\n", 1)
-    status, *lines = head.decode("latin-1").split("\r\n")
-    return Answer(int(status.split()[1]), {k.lower(): v for k, v in (line.split(": ", 1) for line in lines)}, body)
-
-
-def _content_length(data: bytes) -> int:
-    head = data.split(b"\r\n\r\n", 1)[0].lower()
-    return int(head.split(b"content-length: ")[1].split(b"\r\n")[0])
-
-
-def test_a_body_that_declares_too_many_bytes_is_refused_unread(strict_server: RunningServer) -> None:
-    request = b"POST /denoise HTTP/1.1\r\nHost: x\r\nContent-Length: 100001\r\nExpect: 100-continue\r\n\r\n"
-    problem = _raw(strict_server, request).problem()
-    assert (problem["status"], problem["code"]) == (413, "too_many_bytes")
-    assert "100000" in problem["detail"]
-
-
-def test_a_chunked_body_is_stopped_as_soon_as_it_passes_the_limit(strict_server: RunningServer) -> None:
-    chunk = b"%x\r\n" % 60_000 + bytes(60_000) + b"\r\n"
-    head = b"POST /denoise HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
-    assert _raw(strict_server, head + chunk + chunk).problem()["code"] == "too_many_bytes"  # the body never ends
-    assert not strict_server.spooled_files()
-
-
-def test_clients_that_send_on_still_read_the_refusal(strict_server: RunningServer, tmp_path: Path) -> None:
-    (path := tmp_path / "large").write_bytes(bytes(5_000_000))
-    for arguments in (("-F", f"file=@{path}"), ("-T", str(path)), ("-H", "Expect:", "--data-binary", f"@{path}")):
-        assert curl(*arguments, f"{strict_server.url}/denoise").problem()["code"] == "too_many_bytes"
-
-
-def test_a_cloud_with_too_many_points_is_refused(strict_server: RunningServer) -> None:
-    body = _npy(sphere(4001).astype(np.float32))
-    problem = curl("--data-binary", "@-", f"{strict_server.url}/denoise", stdin=body).problem()
-    assert problem["code"] == "too_many_points"
-    assert "4000" in problem["detail"]
-
-
-def test_a_full_server_says_when_to_come_back(strict_server: RunningServer) -> None:
-    body = _npy(sphere(4000).astype(np.float32))
-    url = f"{strict_server.url}/denoise?iterations=2"
-    first: list[Answer] = []
-    thread = threading.Thread(target=lambda: first.append(curl("--data-binary", "@-", url, stdin=body)))
-    thread.start()
-    second = _until_busy(url, body)
-    thread.join()
-    problem = second.problem()
-    assert (problem["code"], problem["retryable"], problem["status"]) == ("server_busy", True, 503)
-    assert int(second.headers["retry-after"]) > 0
-    assert first[0].status == 200
-
-
-def _until_busy(url: str, body: bytes) -> Answer:
-    for _ in range(20):
-        answer = curl("--data-binary", "@-", f"{url}&strength=7", stdin=body)  # refused either way
-        if answer.status == 503:
-            return answer
-        time.sleep(0.05)
-    raise AssertionError("never busy")
-
-
-def test_the_worker_that_is_killed_is_replaced_and_the_request_still_answered(
-    server: RunningServer, cloud: Path
-) -> None:
-    worker = server.worker_pid()
-    os.kill(worker, signal.SIGSTOP)  # so that the job is certain to be in its hands
-    answers: list[Answer] = []
-    thread = threading.Thread(
-        target=lambda: answers.append(curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise"))
-    )
-    thread.start()
-    wait_for(lambda: bool(server.spooled_files()))
-    time.sleep(0.3)
-    os.kill(worker, signal.SIGKILL)
-    thread.join()
-    assert load(answers[0]).shape == (POINTS, 3)
-    assert server.worker_pid() != worker
-    assert curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise").body == answers[0].body
-
-
-def test_a_client_that_goes_away_frees_the_worker_and_leaves_no_file(
-    server: RunningServer, cloud: Path, large_cloud: Path
-) -> None:
-    with pytest.raises(httpx2.ReadTimeout), large_cloud.open("rb") as body:
-        httpx2.post(f"{server.url}/denoise?iterations=10", content=body, timeout=httpx2.Timeout(30, read=1.5))
-    began = time.monotonic()
-    assert curl("-F", f"file=@{cloud}", "-F", "iterations=1", f"{server.url}/denoise").status == 200
-    assert time.monotonic() - began < 15, "the canceled job was computed to its end"
-    wait_for(lambda: not server.spooled_files())
-
-
-def test_health_answers_fast_while_a_job_runs(server: RunningServer, large_cloud: Path) -> None:
-    process = subprocess.Popen(
-        ["curl", "-s", "--data-binary", f"@{large_cloud}", f"{server.url}/denoise?iterations=1"],
-        stdout=subprocess.DEVNULL,
-    )
-    try:
-        wait_for(lambda: bool(server.spooled_files()))
-        with httpx2.Client(base_url=server.url) as client:
-            seconds = []
-            for _ in range(40):
-                began = time.perf_counter()
-                assert client.get("/healthz").status_code == 200
-                seconds.append(time.perf_counter() - began)
-                time.sleep(0.02)
-        assert process.poll() is None, "the job was over too early to tell"
-        assert np.median(seconds) < 0.05
-        assert max(seconds) < 1.0
-    finally:
-        process.kill()
-        process.wait()
-
-
 def test_the_openapi_document_has_examples_and_problems(server: RunningServer) -> None:
     document = json.loads(curl(f"{server.url}/openapi.json").body)
     post = document["paths"]["/denoise"]["post"]
@@ -474,4 +295,4 @@ def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer) -> 
     assert ((table[:, :3] * table[:, 3:]).sum(axis=1) > 0).all()
     for bad in (f"{query}&format=xyz", f"{server.url}/denoise?normals=flip"):
         assert curl("--data-binary", "@-", bad, stdin=body).problem()["status"] == 422
-    assert curl("--data-binary", "@-", query, stdin=_npy(xyz)).problem()["code"] == "unsupported_cloud"
+    assert curl("--data-binary", "@-", query, stdin=npy(xyz)).problem()["code"] == "unsupported_cloud"
