@@ -30,6 +30,9 @@ __all__ = ["NoiseReader", "Reading"]
 # smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
 _AGAIN_ZOOMS, _AGAIN_PROBES, _AGAIN_POINTS = (0.5, 0.25), 24, 2500
 _AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
+# Where patches reach far, thin walls and bends are read as noise, so what is loud there is read once more, of more of
+# the points shown at half their size, in patches no larger than this.
+_NEAR = 0.15
 _MOST_POINTS = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
 
 
@@ -42,7 +45,7 @@ class Reading:
     object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
     patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what the
     DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's points
-    have, or less.
+    have, or less; loud: whether an object has more noise than LOUD_NOISE, before the first pass.
     """
 
     distance: float
@@ -54,6 +57,7 @@ class Reading:
     noise_in_radii: float = 0.0
     probed: Mapping[int, float] = field(default_factory=dict)
     usual: float = 0.0
+    loud: bool = False
 
 
 class NoiseReader:
@@ -82,7 +86,7 @@ class NoiseReader:
             probed = known if parts == (1,) else {}
             return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
-        zoom, parts, in_radii = 1.0, (1,), 0.0
+        zoom, parts, in_radii, loud = 1.0, (1,), 0.0, False
         lie = Lie.of(here, probes, noise, each=self._processor.each) if first is None else first.lie
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
@@ -90,14 +94,15 @@ class NoiseReader:
             if first is None:
                 noise = self._read_again(here, tiling, noise)
                 zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
-            elif first.noise_std > LOUD_NOISE and noise > _AGAIN_FROM * self._most:
-                zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
+                loud = noise > LOUD_NOISE and self._is_loud(here, tiling, noise, float(np.median(probes.radii)))
+            elif first.loud and noise > _AGAIN_FROM * self._most:
+                zoom = zoom_of_rest(noise, self._made_smaller(self._thinned(here, tiling, 4), 0.5))
         if parts != (1,):  # of other patches
-            return Reading(distance, noise, scene, lie, zoom, parts, in_radii)
+            return Reading(distance, noise, scene, lie, zoom, parts, in_radii, loud=loud)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, lie, zoom, parts, in_radii, known)
+        return Reading(distance, noise, scene, lie, zoom, parts, in_radii, known, loud=loud)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
@@ -109,7 +114,7 @@ class NoiseReader:
         for zoom in _AGAIN_ZOOMS:
             if noise < enough * most:
                 break
-            again = self._made_smaller(here, tiling, zoom)
+            again = self._made_smaller(self._thinned(here, tiling, round(1 / zoom**2)), zoom)
             if again < _AGAIN_ABOVE * most:
                 break
             noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
@@ -136,7 +141,7 @@ class NoiseReader:
         """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
         usual = np.inf
         for zoom in _AGAIN_ZOOMS:
-            some = self._thinned(here, tiling, zoom)
+            some = self._thinned(here, tiling, round(1 / zoom**2))
             probes, _ = self._tile(some).probes(_AGAIN_PROBES)
             scales = patch_scales(probes.radii, scene=True)
             again, usual = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
@@ -145,14 +150,19 @@ class NoiseReader:
                 break
         return noise, max(noise, usual)
 
-    def _thinned(self, here: Floats, tiling: Tiling, zoom: float) -> Floats:
-        """Return so few points that patches are as large as before where they are shown zoom times their size."""
-        parts = min(round(1 / zoom**2), len(here) // _AGAIN_POINTS)
-        return here[parted(here, tiling.tiles, max(1, parts))[0]]
+    def _is_loud(self, here: Floats, tiling: Tiling, noise: float, radius: float) -> bool:
+        """Say whether an object with patches of a radius, whose noise was read far around, has that much."""
+        parts = round(min((2 * _NEAR / max(radius, 1e-9)) ** 2, 4))
+        near = self._made_smaller(self._thinned(here, tiling, parts), 0.5)
+        return (noise + near) / 2 > LOUD_NOISE
 
-    def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
-        """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
-        some = self._thinned(here, tiling, zoom)
+    def _thinned(self, here: Floats, tiling: Tiling, parts: int) -> Floats:
+        """Return one of so many parts of the points, or of fewer where that would be too few."""
+        parts = max(1, min(parts, len(here) // _AGAIN_POINTS))
+        return here[parted(here, tiling.tiles, parts)[0]]
+
+    def _made_smaller(self, some: Floats, zoom: float) -> float:
+        """Read the noise of an object of some points shown smaller."""
         probes, _ = self._tile(some).probes(_AGAIN_PROBES)
         scales = patch_scales(probes.radii, scene=False, zoom=zoom)
         return self._noise_std(self._processor.distances(some, probes, scales), scales)
