@@ -96,7 +96,7 @@ class NoiseReader:
                 zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
                 loud = noise > LOUD_NOISE and self._is_loud(here, tiling, noise, float(np.median(probes.radii)))
             elif first.loud and noise > _AGAIN_FROM * self._most:
-                zoom = zoom_of_rest(noise, self._made_smaller(self._thinned(here, tiling, 4), 0.5))
+                zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
         if parts != (1,):  # of other patches
             return Reading(distance, noise, scene, lie, zoom, parts, in_radii, loud=loud)
         if zoom != 1.0:
@@ -114,7 +114,7 @@ class NoiseReader:
         for zoom in _AGAIN_ZOOMS:
             if noise < enough * most:
                 break
-            again = self._made_smaller(self._thinned(here, tiling, round(1 / zoom**2)), zoom)
+            again = self._made_smaller(here, tiling, zoom)
             if again < _AGAIN_ABOVE * most:
                 break
             noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
@@ -141,7 +141,7 @@ class NoiseReader:
         """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
         usual = np.inf
         for zoom in _AGAIN_ZOOMS:
-            some = self._thinned(here, tiling, round(1 / zoom**2))
+            some = self._thinned(here, tiling, zoom)
             probes, _ = self._tile(some).probes(_AGAIN_PROBES)
             scales = patch_scales(probes.radii, scene=True)
             again, usual = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
@@ -152,23 +152,34 @@ class NoiseReader:
 
     def _is_loud(self, here: Floats, tiling: Tiling, noise: float, radius: float) -> bool:
         """Say whether an object with patches of a radius, whose noise was read far around, has that much."""
-        parts = round(min((2 * _NEAR / max(radius, 1e-9)) ** 2, 4))
-        near = self._made_smaller(self._thinned(here, tiling, parts), 0.5)
+        zoom = _AGAIN_ZOOMS[0]
+        thinned = max(zoom, radius * zoom / _NEAR)
+        if _parts(here, thinned) == _parts(here, zoom):  # what was read reaches no farther
+            return True
+        near = self._read_smaller(self._thinned(here, tiling, thinned), zoom)
         return (noise + near) / 2 > LOUD_NOISE
 
-    def _thinned(self, here: Floats, tiling: Tiling, parts: int) -> Floats:
-        """Return one of so many parts of the points, or of fewer where that would be too few."""
-        parts = max(1, min(parts, len(here) // _AGAIN_POINTS))
-        return here[parted(here, tiling.tiles, parts)[0]]
+    def _thinned(self, here: Floats, tiling: Tiling, zoom: float) -> Floats:
+        """Return so few points that patches are as large as before where they are shown zoom times their size."""
+        return here[parted(here, tiling.tiles, _parts(here, zoom))[0]]
 
-    def _made_smaller(self, some: Floats, zoom: float) -> float:
-        """Read the noise of an object of some points shown smaller."""
+    def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
+        """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
+        return self._read_smaller(self._thinned(here, tiling, zoom), zoom)
+
+    def _read_smaller(self, some: Floats, zoom: float) -> float:
+        """Read the noise of some points of an object shown smaller."""
         probes, _ = self._tile(some).probes(_AGAIN_PROBES)
         scales = patch_scales(probes.radii, scene=False, zoom=zoom)
         return self._noise_std(self._processor.distances(some, probes, scales), scales)
 
     def _noise_std(self, distances: Floats, scales: Floats) -> float:
         return float(np.median(self.noise_stds(distances, scales)))
+
+
+def _parts(here: Floats, zoom: float) -> int:
+    """Return of how many parts of the points one is as few as `NoiseReader._thinned` asks for, and not too few."""
+    return max(1, min(round(1 / zoom**2), len(here) // _AGAIN_POINTS))
 
 
 def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> float:
