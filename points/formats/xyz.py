@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,23 +18,15 @@ from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import Lines, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
 
 __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
 
-MAX_COLUMNS = 4096
 MAX_LINE_BYTES = 1 << 23
 _COMMENTS = (b"#", b"//")
+_REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
-# Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
-_POSITIONS = (
-    AXES,
-    ("points:0", "points:1", "points:2"),
-    ("px", "py", "pz"),
-    ("pos_x", "pos_y", "pos_z"),
-    *(("easting", "northing", height) for height in ("elevation", "height", "altitude", "z")),
-)
-_UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _Offsets = npt.NDArray[np.int64]
 
@@ -71,8 +64,9 @@ class XyzSource:
 class Xyz(Format):
     """Read and write text tables of at least three columns between white space, commas or semicolons.
 
-    x, y, z are the columns that a line of names above the table says, and the first three where there is none; names
-    of more than three columns that say nothing of positions are refused. Comment lines (`#`, `//`), blank lines, a line
+    x, y, z are the columns that a line of names above the table says, and the first three where there is none
+    (`titles`); names of more than three columns that say nothing of positions, or that are of more or fewer columns
+    than the table has, are refused. Comment lines (`#`, `//`), blank lines, a line
     with the number of points and columns of any text are kept.
     """
 
@@ -134,64 +128,34 @@ def _layout(raw: bytes) -> Layout:
     """Read what stands above the table, up to the first line that is neither blank, comment, count nor names."""
     at, line = len(_BOM) if raw.startswith(_BOM) else 0, 1
     declared: int | None = None
-    names: bytes | None = None
-    remark = b""
+    names: Title | None = None
+    remarks: deque[Title] = deque(maxlen=_REMARKS)
     while at < len(raw):
         found = _LINE_END.search(raw, at)
         end = found.end() if found else len(raw)
         text = raw[at:end].strip()
         if text.startswith(_COMMENTS):
-            remark = text.lstrip(b"#/ ")
+            remarks.append(Title(line, text[:_REMARK_BYTES].lstrip(b"#/ ")))
         elif text and declared is None and names is None and text.isdigit() and len(text) <= 18:
             declared = int(text)
-        elif text and names is None and _are_names(_words(text)):
-            names = text
+        elif text and names is None and _are_names(words_of(text)):
+            names = Title(line, text.lstrip(b"% "))  # MATLAB's comments
         elif text:
-            return _described(at, line, declared, text, names, remark)
+            return _described(at, line, declared, text, names, remarks)
         at, line = end, line + 1
     return Layout(len(raw), line, declared, None, ("x", "y", "z"), (0, 1, 2))
 
 
-def _described(begin: int, line: int, declared: int | None, row: bytes, names: bytes | None, remark: bytes) -> Layout:
-    columns = len(_words(row))
-    if columns < 3:
-        raise MalformedFile(f"line {line} has {columns} columns, a point needs three: {shown(row)}")
-    if columns > MAX_COLUMNS:
+def _described(
+    begin: int, line: int, declared: int | None, row: bytes, names: Title | None, remarks: Iterable[Title]
+) -> Layout:
+    cells = words_of(row)
+    if len(cells) < 3:
+        raise MalformedFile(f"line {line} has {len(cells)} columns, a point needs three: {shown(row)}")
+    if len(cells) > MAX_COLUMNS:
         raise UnsupportedCloud(f"line {line} has more than {MAX_COLUMNS} columns, the limit")
-    labels = [f"column_{column + 1}" for column in range(columns)]
-    axes = (0, 1, 2)
-    for text in (names, remark):
-        words = [word.strip(b"\"' ").decode("utf-8", "replace")[:80] for word in _words(text or b"")]
-        if len(words) != columns:
-            continue  # no title of this table
-        if found := _axes(words):
-            axes = found
-            labels = [words[i] if words.count(words[i]) == 1 and words[i] else labels[i] for i in range(columns)]
-            break
-        if names and text is names and columns > 3:
-            known = "; ".join(", ".join(three) for three in _POSITIONS)
-            raise MalformedFile(
-                f"the names above line {line} do not say which columns are x, y, z: {shown(names)}; known are {known}"
-            )
-    return Layout(begin, line, declared, _delimiter(row), tuple(labels), axes)
-
-
-def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:
-    """Return which of the columns so named are x, y and z, where each is named once."""
-    plain = [_UNIT.sub("", word.lower()) for word in words]
-    for x, y, z in _POSITIONS:
-        if plain.count(x) == plain.count(y) == plain.count(z) == 1:
-            return plain.index(x), plain.index(y), plain.index(z)
-    return None
-
-
-def _delimiter(row: bytes) -> bytes | None:
-    return next((mark for mark in (b";", b",") if mark in row), None)
-
-
-def _words(row: bytes) -> list[bytes]:
-    """Split a row; what is beyond the limit stays together as one more word."""
-    return [word.strip() for word in row.split(_delimiter(row), MAX_COLUMNS)] if row else []
+    labels, axes = named_columns(names, list(remarks), cells, line)
+    return Layout(begin, line, declared, delimiter_of(row), labels, axes)
 
 
 def _are_names(words: Sequence[bytes]) -> bool:

@@ -69,6 +69,31 @@ def test_columns_of_numbers_become_attributes_under_their_names(tmp_path: Path) 
     assert list(read(tmp_path, b"1 2 3 4\n5 6 7 8\n").attributes) == ["column_4"]
 
 
+@pytest.mark.parametrize(
+    ("raw", "names"),
+    [
+        (b"id,x,y,z\n7,1,2,3,\n", ["id"]),  # a delimiter at the end
+        (b"id,x,y,z,\n7,1,2,3\n", ["id"]),
+        (b",x,y,z\n7,1,2,3\n", ["column_1"]),  # pandas
+        (b"Point Id\tX\tY\tZ\n7\t1\t2\t3\n", ["Point Id"]),
+        (b"id x [m] y [m] z [m]\n7 1 2 3\n", ["id"]),
+        (b"% id x y z\n7 1 2 3\n", ["id"]),  # MATLAB
+        (b"# columns: id x y z\n7 1 2 3\n", ["id"]),
+        (b"# id x y z\n# exported 2024\n7 1 2 3\n", ["id"]),  # numpy.savetxt
+    ],
+)
+def test_titles_as_programs_write_them_say_where_positions_are(raw: bytes, names: list[str], tmp_path: Path) -> None:
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3]])
+    assert list(cloud.attributes) == names
+    assert written(tmp_path, cloud) == raw
+
+
+@pytest.mark.parametrize("remark", [b"// X Y Z", b"# Coordinates x y z in UTM 32", b"# id x y z of a scan in May"])
+def test_a_remark_that_is_no_title_of_the_table_changes_nothing(remark: bytes, tmp_path: Path) -> None:
+    np.testing.assert_array_equal(read(tmp_path, remark + b"\n1 2 3 4 5 6\n").xyz, [[1, 2, 3]])
+
+
 def test_nan_and_infinite_positions_are_read_and_kept(tmp_path: Path) -> None:
     raw = b"nan NaN -nan\ninf -Inf 1e5\n1 2 3\n"
     cloud = read(tmp_path, raw)
@@ -130,6 +155,13 @@ MALFORMED = {
         b"id,lon,lat,h\n1,2,3,4\n",
         r"names above line 2 .*id,lon,lat,h.*easting, northing",
     ),
+    "fewer names than columns": (
+        b"x y z\n1 2 3 4\n",
+        r"line 1 names 3 columns.*'x y z'.*line 2 has 4",
+    ),  # R's row numbers
+    "more names than columns": (b"a b id x y z\n1 2 3 4\n", r"line 1 names 6 or more columns.*line 2 has 4"),
+    "a cell less than names": (b"id\tcode\tx\ty\tz\n1\t\t2\t3\t4\n", r"line 1 names 5 .*line 2 has 4"),
+    "a name with a comma": (b'"id, n",x,y,z\n1,2,3,4\n', r"line 1 names 5 .*line 2 has 4"),
     "binary": (b"1 2 3\n\x00\x01\x02", r"0x00"),
     "UTF-16": ("1 2 3\n".encode("utf-16"), r"0x00"),
 }

@@ -1,0 +1,111 @@
+"""What stands above a text table: which of its columns are x, y, z, and what the others are called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from straightpcf.points.errors import MalformedFile
+from straightpcf.points.formats.positions import AXES
+from straightpcf.points.formats.text import shown
+
+__all__ = ["MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "words_of"]
+
+MAX_COLUMNS = 4096
+# Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
+_POSITIONS = (
+    AXES,
+    ("points:0", "points:1", "points:2"),
+    ("px", "py", "pz"),
+    ("pos_x", "pos_y", "pos_z"),
+    *(("easting", "northing", height) for height in ("elevation", "height", "altitude", "z")),
+)
+_UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
+_BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
+_LEAD = re.compile(rb"^[^,;\t:]*:\s+")  # columns: x y z
+
+
+@dataclass(frozen=True)
+class Title:
+    """Hold what a line above the table says, without the marks of a comment; line: its number."""
+
+    line: int
+    text: bytes
+
+
+def named_columns(
+    names: Title | None, remarks: Sequence[Title], cells: Sequence[bytes], line: int
+) -> tuple[tuple[str, ...], tuple[int, int, int]]:
+    """Return a name for each column, and which columns are x, y and z: the first three where nothing says it.
+
+    names: a line of names above the table; remarks: the comments there, of which the last that names them counts;
+    cells: the first row's, whose number is `line`. Raises MalformedFile where names and rows do not go together.
+    """
+    columns = len(cells)
+    labels = [f"column_{column + 1}" for column in range(columns)]
+    for title in (names, *reversed(remarks)):
+        fitting = [words for some in _meant(title, columns) if (words := _fitted(some, cells))]
+        for words in fitting:
+            if axes := _axes(words):
+                once = [word if word and words.count(word) == 1 else "" for word in words]
+                return tuple(word or label for word, label in zip(once, labels, strict=True)), axes
+        if title is names and columns > 3:  # a remark may be any text
+            _refuse(title, line, columns, fits=bool(fitting))
+    return tuple(labels), (0, 1, 2)
+
+
+def delimiter_of(row: bytes) -> bytes | None:
+    """Return what a row has between its cells; None for white space."""
+    return next((mark for mark in (b";", b",") if mark in row), None)
+
+
+def words_of(row: bytes, most: int = MAX_COLUMNS) -> list[bytes]:
+    """Split a row; what is beyond the limit stays together as one more word."""
+    return [word.strip() for word in row.split(delimiter_of(row), most)] if row else []
+
+
+def _meant(title: Title | None, columns: int) -> Iterator[list[str]]:
+    """Yield the names in a title as they may be meant: `x [m]` as one, `Point Id` between tabs, `columns: x y z`.
+
+    What is beyond columns + 1 names stays together as one more.
+    """
+    if title is None:
+        return
+    for text in (title.text, _LEAD.sub(b"", title.text)):
+        ways = [words_of(text, columns + 1)]
+        if delimiter_of(text) is None:
+            ways += [text.split(b"\t", columns + 1), _BEFORE_UNIT.sub(b"", text).split(None, columns + 1)]
+        for words in ways:
+            yield [word[:320].strip(b"\"' ").decode("utf-8", "replace")[:80] for word in words]
+
+
+def _fitted(names: list[str], cells: Sequence[bytes]) -> list[str] | None:
+    """Return a name for each cell of a row, or None; a delimiter at the end of either is no column of its own."""
+    if len(names) == len(cells) + 1 and not names[-1]:
+        return names[:-1]
+    if len(names) == len(cells) - 1 and not cells[-1]:
+        return [*names, ""]
+    return names if len(names) == len(cells) else None
+
+
+def _refuse(names: Title | None, line: int, columns: int, *, fits: bool) -> None:
+    """Raise where a line of names says nothing of positions, or is of more or fewer columns than a row has."""
+    if names and fits:
+        known = "; ".join(", ".join(three) for three in _POSITIONS)
+        said = f"the names above line {line} do not say which columns are x, y, z: {shown(names.text)}"
+        raise MalformedFile(f"{said}; known are {known}")
+    for words in _meant(names, columns):
+        if names and _axes(words):
+            more = " or more" if len(words) > columns + 1 else ""
+            said = f"line {names.line} names {len(words)}{more} columns: {shown(names.text)}"
+            raise MalformedFile(f"{said}; line {line} has {columns}, so which of them are x, y, z is not known")
+
+
+def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return which of the columns so named are x, y and z, where each is named once."""
+    plain = [_UNIT.sub("", word.lower()) for word in words]
+    for x, y, z in _POSITIONS:
+        if plain.count(x) == plain.count(y) == plain.count(z) == 1:
+            return plain.index(x), plain.index(y), plain.index(z)
+    return None
