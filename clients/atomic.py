@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import uuid
@@ -9,15 +10,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["check_target", "replaced_when_complete"]
+__all__ = ["check_target", "place_named", "replaced_when_complete"]
+
+_NAME = 40  # characters of a name that a file beside it begins with: with its marks it may be no longer than 255 bytes
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def check_target(path: Path) -> None:
     """Raise OSError where a file cannot be written or replaced, before work is put into what would be lost."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} is no folder to write {path.name} to")
+    if not _target(path).parent.is_dir():
+        raise FileNotFoundError(f"{path} is a link to {path.readlink()}, in a folder that is not there")
     if path.exists() and not path.is_file():  # /dev/null, too, would be taken away
         raise FileExistsError(f"{path} is there and is no file: a result cannot take its place")
+
+
+@contextmanager
+def place_named(path: str | Path) -> Iterator[None]:
+    """Say of a disk that is full, or a file that may not grow, where that is: to a write nobody has told it."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno in _NO_ROOM:
+            error.filename = os.fspath(path)
+        raise
 
 
 @contextmanager
@@ -27,15 +44,24 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
     A file that is replaced hands on its mode, and a symbolic link stays one: what it points to is replaced.
     """
     check_target(path)
-    target = path.resolve()
+    target = _target(path)
     mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
-    unfinished = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:12]}.part{target.suffix}")
+    unfinished = target.with_name(f".{target.stem[:_NAME]}.{uuid.uuid4().hex[:12]}.part{target.suffix[:_NAME]}")
     # Nobody who may not read the result can read it while it is written; a read-only one has to be written, too.
     os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else mode | stat.S_IWUSR))
     try:
-        yield unfinished
+        with place_named(path):
+            yield unfinished
         if mode is not None:
             unfinished.chmod(mode)
         unfinished.replace(target)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _target(path: Path) -> Path:
+    """Follow links."""
+    try:
+        return path.resolve()
+    except RuntimeError as exc:  # until Python 3.13
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path)) from exc

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -27,11 +27,10 @@ from straightpcf.clients.console import (
     show_noise,
 )
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
+from straightpcf.clients.stdio import STDIO, input_file, output_file
 from straightpcf.points import errors
 
 __all__ = ["app", "main"]
-
-STDIO = Path("-")
 
 
 class Device(StrEnum):
@@ -108,7 +107,7 @@ def denoise(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Denoise one cloud, in this process or on a server."""
-    from straightpcf.points.formats import format_for, format_named
+    from straightpcf.points.formats import format_named, format_wanted
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
@@ -117,11 +116,11 @@ def denoise(
         check_target(target)
     if format is not None:
         format = format_named(format).name
-    elif target != STDIO and target.suffix.lower() != Path(name or "").suffix.lower():
-        format = format_for(target.name).name
+    elif target != STDIO:
+        format = format_wanted(target.name, name)
     if url is not None and (device != Device.auto or weights is not None or threads is not None):
         raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
-    with interruptible(), _input(source, name) as path, _output(target, Path(name or "").suffix) as out:
+    with interruptible(), input_file(source, name) as path, output_file(target, Path(name or "").suffix) as out:
         if url is not None:
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
                 done = client.denoise(
@@ -303,45 +302,6 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 
 
 job_commands.install(app)
-
-
-@contextmanager
-def _input(source: Path, name: str | None) -> Iterator[Path]:
-    import tempfile
-
-    from straightpcf.points.formats import recognised
-    from straightpcf.points.formats.base import HEAD_BYTES
-
-    if source != STDIO:
-        if not source.is_file():
-            raise FileNotFoundError(f"{source} is no file")
-        yield source
-        return
-    with tempfile.NamedTemporaryFile() as spool:  # formats are read from files, not from pipes
-        _copy(sys.stdin.buffer, spool)
-        spool.seek(0)
-        recognised(spool.read(HEAD_BYTES), name)
-        yield Path(spool.name)
-
-
-@contextmanager
-def _output(target: Path, suffix: str) -> Iterator[Path]:
-    import tempfile
-
-    if target != STDIO:
-        yield target
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield (path := Path(folder) / f"result{suffix}")
-        with path.open("rb") as result:
-            _copy(result, sys.stdout.buffer)
-
-
-def _copy(source: BinaryIO | Any, target: BinaryIO | Any) -> None:
-    import shutil
-
-    shutil.copyfileobj(source, target)
-    target.flush()
 
 
 def _in_process(device: Device, weights: Path | None, threads: int | None) -> Callable[..., Any]:

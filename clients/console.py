@@ -1,7 +1,7 @@
 """What the command line shows and how it ends: progress on stderr, tables and JSON on stdout, one line for an error.
 
 Exit codes: 0 done, 2 usage (a port that is taken, too), 3 refused (bad input, no such job), 4 a device or a package is
-missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted (by SIGTERM, too) or canceled.
+missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted (by SIGTERM or SIGHUP, too) or canceled.
 """
 
 from __future__ import annotations
@@ -74,14 +74,17 @@ def needs(extra: str) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Take SIGTERM for Ctrl-C, so that what was begun here and on a server is ended."""
+    """Take SIGTERM, and a terminal that is closed, for Ctrl-C, so that what was begun here and on a server is ended."""
     import signal
 
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hangup = [number for name in ("SIGHUP",) if (number := getattr(signal, name, None))]  # Windows has none
+    ends = [signal.SIGTERM, *(number for number in hangup if signal.getsignal(number) != signal.SIG_IGN)]  # nohup
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ends}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -92,11 +95,11 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
 
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(title, total=1.0, note="")

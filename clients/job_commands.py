@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ import typer
 
 from straightpcf.clients.atomic import check_target
 from straightpcf.clients.console import interruptible, print_json, print_table, progress_bar, show_noise
+from straightpcf.clients.stdio import stdin, stdout
 from straightpcf.points.errors import InvalidOptions
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def submit(
         raise InvalidOptions(f"--name is of one file, and there are {len(sources)}")
     with connect(url, api_key) as client:
         for source in sources:
-            content: Any = sys.stdin.buffer.read() if str(source) == "-" else source
+            content: Any = stdin().read() if str(source) == "-" else source
             job = client.jobs.create(
                 content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
                 format=format, name=name, id=id,
@@ -145,15 +145,16 @@ def result(
 ) -> None:
     """Wait for a job and download its result, whole and checked."""
     to_stdout = str(target) == "-"
-    if not to_stdout:
+    out = stdout() if to_stdout else None
+    if out is None:
         check_target(target)
     with connect(url, api_key) as client, progress_bar(id) as show:
         job = client.jobs.get(id)
         if not job.info.finished:
             job.wait(on_progress=show)
         found = job.result(None if to_stdout else target)
-        if to_stdout:
-            sys.stdout.buffer.write(found.read())
+        if out is not None:
+            out.write(found.read())
     if as_json and not to_stdout:
         print_json(found.job.json["report"])
     else:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import stat
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +17,7 @@ from straightpcf.points.formats import FORMATS
 __all__ = ["watch_folder"]
 
 LOOK_SECONDS = 1.0
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 Outcome = tuple[Path, Any | Exception]
 Stamp = tuple[int, int]
@@ -28,10 +31,12 @@ def watch_folder(
     A result gets the time of its input as it was before it was read: an input that is replaced meanwhile, even by an
     older file, is seen to be another. A file is taken when its size and time have not changed for a second, so that one
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
-    server could not be had, at the next look. Yields each outcome. once: look once, and end.
+    server could not be had, at the next look, or, where the disk was full, when more of it is free. Yields each
+    outcome. once: look once, and end.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
     tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
+    full: dict[Path, int] = {}  # bytes that were free when they were not enough
     before: dict[Path, Stamp] = {}
     while True:
         seen = {
@@ -41,7 +46,7 @@ def watch_folder(
         }
         for path, stamp in seen.items():
             result = target / path.name
-            if tried.get(path) == stamp or _is_done(result, stamp):
+            if tried.get(path) == stamp or _is_done(result, stamp) or _is_full(target, full.get(path)):
                 continue
             if not once and before.get(path) != stamp:
                 continue  # perhaps it still grows
@@ -51,7 +56,10 @@ def watch_folder(
             except (ConnectionFailed, ServerBusy) as error:
                 yield path, error
             except Exception as error:
-                tried[path] = stamp
+                if isinstance(error, OSError) and error.errno in _NO_ROOM:
+                    full[path] = shutil.disk_usage(target).free
+                else:
+                    tried[path] = stamp
                 yield path, error
             else:
                 tried[path] = stamp
@@ -66,9 +74,13 @@ def _stamp(path: Path) -> Stamp | None:
     """Return the size and time of a file; None if it is none, or not any more."""
     try:
         status = path.stat()
-    except FileNotFoundError:
+    except OSError:  # gone meanwhile, a link to itself
         return None
     return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None
+
+
+def _is_full(target: Path, free: int | None) -> bool:
+    return free is not None and shutil.disk_usage(target).free <= free
 
 
 def _is_done(result: Path, stamp: Stamp) -> bool:

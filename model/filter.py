@@ -30,7 +30,7 @@ from straightpcf.model.restraint import made_of, reaches
 from straightpcf.model.spacing import Lie
 from straightpcf.model.tiles import Tiling, parted, split
 from straightpcf.model.turns import turns
-from straightpcf.points.errors import DeviceUnavailable, InvalidOptions, TooFewPoints
+from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, TooFewPoints
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
 __all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
@@ -115,7 +115,7 @@ def denoise(
 ) -> DenoiseResult:
     """Filter (N, 3) points with the shipped weights: `load_filter` and `Filter.denoise` in one call."""
     options = DenoiseOptions.parse(iterations=str(iterations), seed=str(seed))
-    return load_filter(device=device).denoise(np.asarray(xyz, dtype=np.float64), options)
+    return load_filter(device=device).denoise(xyz, options)
 
 
 class Filter:
@@ -186,14 +186,14 @@ class Filter:
 
     def denoise(
         self,
-        xyz: npt.NDArray[np.float64],
+        xyz: npt.ArrayLike,
         options: DenoiseOptions | None = None,
         *,
         on_progress: Callable[[float], None] | None = None,
     ) -> DenoiseResult:
         """Move (N, 3) points to the surface; an exception raised by on_progress (0..1) ends the work.
 
-        Raises TooFewPoints below MIN_POINTS finite rows.
+        Numbers of other types become float64. Raises TooFewPoints below MIN_POINTS finite rows, InvalidCloud.
         """
         run = Run(self, xyz, options or DenoiseOptions())
         began = time.monotonic()
@@ -202,7 +202,7 @@ class Filter:
                 on_progress(patch.progress)
         return run.result(time.monotonic() - began)
 
-    def patches(self, xyz: npt.NDArray[np.float64], options: DenoiseOptions | None = None) -> Iterator[FinishedPatch]:
+    def patches(self, xyz: npt.ArrayLike, options: DenoiseOptions | None = None) -> Iterator[FinishedPatch]:
         """Yield patches of (N, 3) points as they are settled; the last position given for a point is its result.
 
         Rows that are not finite belong to no patch. Order and batching never change a position.
@@ -213,10 +213,8 @@ class Filter:
 class Run:
     """One cloud on its way through the filter."""
 
-    def __init__(self, owner: Filter, xyz: npt.NDArray[np.float64], options: DenoiseOptions) -> None:
-        if xyz.ndim != 2 or xyz.shape[1] != 3:
-            raise TooFewPoints(f"points must be (N, 3), got {xyz.shape}")
-        self.filter, self.options, self.xyz = owner, options, xyz
+    def __init__(self, owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> None:
+        self.filter, self.options, self.xyz = owner, options, (xyz := _numbers(points))
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
@@ -385,3 +383,10 @@ class Run:
         owner = self.filter
         tiles = tiles or split(xyz, owner.tile_points)
         return Tiling(xyz, tiles, coverage=owner.coverage, seed=self.options.seed, device=owner.device)
+
+
+def _numbers(xyz: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    array = np.asarray(xyz)
+    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
+        raise InvalidCloud(f"points must be (N, 3) numbers, got {array.shape} {array.dtype}")
+    return array.astype(np.float64, copy=False)

@@ -22,12 +22,14 @@ class PointCloud:
     attributes: name -> (N,) or (N, M) array, carried and never changed.
     source: what its format needs to write the file again (header, other elements, VLRs); opaque to others.
     normals: (N, 3) float64 to write in the place of the file's own; None: as they are.
+    beside: names of what else the file holds (faces, columns of text, a reference system), kept by its own format only.
     """
 
     xyz: npt.NDArray[np.float64]
     attributes: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     source: Any = None
     normals: npt.NDArray[np.float64] | None = None
+    beside: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse positions that are not (N, 3) float64 and attributes of another length."""

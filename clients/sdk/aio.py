@@ -163,7 +163,7 @@ class AsyncJob:
 
     async def result(self, target: str | Path | None = None) -> Denoised:
         """Do as `Job.result`."""
-        return await self._transport.run(flows.fetch(self.info, None if target is None else Path(target)))
+        return await self._transport.run(flows.result(self.info, None if target is None else Path(target)))
 
     async def cancel(self) -> JobInfo:
         """Do as `Job.cancel`."""

@@ -181,7 +181,7 @@ class Job:
 
         Raises JobNotFinished, JobExpired, JobCanceled, or what the job failed with.
         """
-        return self._transport.run(flows.fetch(self.info, None if target is None else Path(target)))
+        return self._transport.run(flows.result(self.info, None if target is None else Path(target)))
 
     def cancel(self) -> JobInfo:
         """End it."""

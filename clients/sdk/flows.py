@@ -34,6 +34,7 @@ __all__ = [
     "health",
     "info",
     "page",
+    "result",
     "wait",
 ]
 
@@ -118,6 +119,15 @@ def fetch(job: JobInfo, target: Path | None, *, source: Source = None, request_i
         yield request.result_call(job.id), download
         content = None if target is not None else file.getvalue()  # type: ignore[attr-defined]
     return Denoised(job=job, request_id=request_id, content=content, path=target, source=source)
+
+
+def result(job: JobInfo, target: Path | None) -> Flow[Denoised]:
+    """Download a result as `fetch` does; raises InvalidRequest where the target's suffix is another format's."""
+    if not job.finished:
+        job = yield from get(job.id)
+    if target is not None and job.report is not None:
+        request.check_suffix(target, job.report.format)
+    return (yield from fetch(job, target))
 
 
 def denoise(

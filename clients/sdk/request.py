@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from straightpcf.clients.atomic import check_target
 from straightpcf.points.errors import InvalidCloud, InvalidRequest, NotFound
-from straightpcf.points.formats import format_for, format_named, recognised
+from straightpcf.points.formats import FORMATS, format_named, format_wanted, recognised
 from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE, MAX_PAGE_SIZE, STATES
@@ -29,6 +29,7 @@ __all__ = [
     "Normals",
     "Source",
     "cancel_call",
+    "check_suffix",
     "delete_call",
     "events_call",
     "get_call",
@@ -115,8 +116,8 @@ def upload_call(
     name = name or own_name
     if name is None and isinstance(body, bytes):
         recognised(body[:HEAD_BYTES], None)
-    if format is None and target is not None and target.suffix.lower() != Path(name or "").suffix.lower():
-        format = format_for(target.name).name
+    if format is None and target is not None:
+        format = format_wanted(target.name, name)
     params = {name: str(value) for name, value in asdict(options).items()}
     if name is not None:
         params["filename"] = name
@@ -203,6 +204,17 @@ def _job(id: str, part: str = "") -> str:
     if not JOB_ID.fullmatch(id):  # it would name another path: "" the list of jobs, ".." the page
         raise NotFound(f"there is no job {id[:64]!r}; an id is {JOB_ID_RULE}")
     return f"/jobs/{id}" + (f"/{part}" if part else "")
+
+
+def check_suffix(target: Path, format: str) -> None:
+    """Raise InvalidRequest where a file of that format would be called another's; one text table is like another."""
+    of_result = format_named(format)
+    named = next((other for other in FORMATS if target.suffix.lower() in other.suffixes), of_result)
+    if named is not of_result and {named.media_type[:5], of_result.media_type[:5]} != {"text/"}:
+        raise InvalidRequest(
+            f"the result is {format}, and {target.name} is a name for {named.name}: "
+            f"call it *{of_result.suffixes[0]}, or hand the cloud over with format {named.name!r}"
+        )
 
 
 def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:

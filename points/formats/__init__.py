@@ -10,7 +10,13 @@ import struct
 from pathlib import Path, PurePath
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile, StraightPCFError, TooManyBytes, UnknownFormat
+from straightpcf.points.errors import (
+    MalformedFile,
+    StraightPCFError,
+    TooManyBytes,
+    UnknownFormat,
+    UnsupportedCloud,
+)
 from straightpcf.points.formats.base import DEFAULT_MAX_POINTS, HEAD_BYTES, Format
 from straightpcf.points.formats.kitti import Kitti
 from straightpcf.points.formats.las import Las, Laz
@@ -27,12 +33,19 @@ __all__ = [
     "estimate_points",
     "format_for",
     "format_named",
+    "format_wanted",
     "read_cloud",
     "recognised",
     "write_cloud",
 ]
 
 FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Csv(), Pts(), Kitti())
+
+# Endings of files that would pass for another format's, and be scrambled.
+_NOT_OURS = {
+    ".pcd.bin": "a nuScenes sweep has five float32 a point, where a KITTI frame (.bin) has four; "
+    "as (N, 5) float32 in a .npy file it can be taken"
+}
 
 
 def estimate_points(path: Path, *, name: str | None = None) -> int:
@@ -93,10 +106,20 @@ def format_for(filename: str) -> Format:
     )
 
 
+def format_wanted(target: str, source: str | None) -> str | None:
+    """Return the name of the format that a target's suffix asks for; None for an unknown one that is the source's, too.
+
+    Raises UnknownFormat.
+    """
+    suffixes = [PurePath(name or "").suffix.lower() for name in (target, source)]
+    known = any(suffixes[0] in format.suffixes for format in FORMATS)
+    return None if suffixes[0] == suffixes[1] and not known else format_for(target).name
+
+
 def recognised(head: bytes, called: str | None) -> Format:
     """Return the format of a file by its first bytes, or by the suffix of what it is called.
 
-    Raises UnknownFormat, MalformedFile if it is empty.
+    Raises UnknownFormat, MalformedFile if it is empty, UnsupportedCloud for what only looks like a format's suffix.
     """
     name = PurePath(called or "the cloud").name
     if not head:
@@ -105,6 +128,9 @@ def recognised(head: bytes, called: str | None) -> Format:
         if format.has_magic and format.sniff(head):
             return format
     begins, suffix = f"{name[:80]} begins with {head[:8]!r}, which no format does", PurePath(name).suffix.lower()
+    for ending, why in _NOT_OURS.items():
+        if name.lower().endswith(ending):
+            raise UnsupportedCloud(f"{name[:80]}: {why}")
     for format in FORMATS:
         if suffix in format.suffixes:
             if not format.has_magic:

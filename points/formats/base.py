@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from pathlib import Path
 from typing import ClassVar
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyPoints
+from straightpcf.points.formats.scalars import not_held
 
 __all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room"]
 
@@ -27,6 +29,7 @@ class Format(ABC):
     media_type: ClassVar[str] = "application/octet-stream"
     writes_normals: ClassVar[bool] = False  # that were recomputed, in the place of the file's own
     has_magic: ClassVar[bool] = True  # False: only the file's suffix says what it is
+    types: ClassVar[Collection[str]] = ()  # of the numbers that a new file has columns for, such as "f4"
 
     @abstractmethod
     def sniff(self, head: bytes) -> bool:
@@ -39,6 +42,10 @@ class Format(ABC):
     @abstractmethod
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read a file; raises MalformedFile, UnsupportedCloud, TooManyPoints, the last before memory is taken."""
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name what a cloud read of another format holds and a file of this one does not, or only rounded."""
+        return [*cloud.beside, *not_held(cloud.attributes, self.types)]
 
     @abstractmethod
     def write(self, cloud: PointCloud, path: Path) -> None:

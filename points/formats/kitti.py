@@ -52,6 +52,11 @@ class Kitti(Format):
         xyz = widened([rows[:, axis] for axis in range(3)])
         return PointCloud(xyz, {"intensity": rows[:, 3]}, KittiSource(raw, xyz.copy()))
 
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name everything but positions and intensity, float32 as in every frame."""
+        held = "intensity" if _has_intensity(cloud) else None
+        return [*cloud.beside, *(name for name in cloud.attributes if name != held)]
+
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the rows with their positions replaced; a cloud of another format as float32, intensity or 0."""
         source = cloud.source
@@ -64,12 +69,16 @@ class Kitti(Format):
         table = np.zeros((len(cloud), 4), "<f4")
         table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
         _check_rounding(cloud.xyz, table[:, :3])
-        intensity = cloud.attributes.get("intensity")
-        if intensity is not None and intensity.ndim == 1 and intensity.dtype.kind in "biuf":
+        if _has_intensity(cloud):
             with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
-                wide = intensity.astype(np.float64)
+                wide = cloud.attributes["intensity"].astype(np.float64)
             table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
         path.write_bytes(table.tobytes())
+
+
+def _has_intensity(cloud: PointCloud) -> bool:
+    values = cloud.attributes.get("intensity")
+    return values is not None and values.ndim == 1 and values.dtype.kind in "biuf"
 
 
 def _check_rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[np.float32]) -> None:

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count, check_room
-from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader, dimensions, read_header
-from straightpcf.points.formats.las_new import new_las
+from straightpcf.points.formats.las_layout import EXTRA_BYTES_ID, LASZIP_ID, LasHeader, dimensions, read_header
+from straightpcf.points.formats.las_new import TYPES, new_las
 from straightpcf.points.formats.laz_codec import pack, packing_record, unpack
 from straightpcf.points.formats.positions import AXES, moved
 
@@ -38,6 +38,7 @@ class Las(Format):
     suffixes: ClassVar[tuple[str, ...]] = (".las",)
     media_type = "application/vnd.las"
     is_compressed = False
+    types = TYPES
 
     def estimate(self, head: bytes, size: int) -> int:
         """Read the header's count; packed points take few bytes."""
@@ -62,7 +63,12 @@ class Las(Format):
         rows = rows.reshape(header.points, header.row_bytes)
         integers = np.ascontiguousarray(rows[:, :12]).view("<i4").reshape(header.points, 3)
         xyz = integers * header.scales + header.offsets
-        return PointCloud(xyz, dimensions(rows, header), LasSource(raw, header, rows, xyz.copy()))
+        source = LasSource(raw, header, rows, xyz.copy())
+        return PointCloud(xyz, dimensions(rows, header), source, beside=_records(header))
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name nothing of a file that is only packed or unpacked."""
+        return [] if isinstance(cloud.source, LasSource) else super().left_behind(cloud)
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read, packed or not, with its moved points requantised; or a new one."""
@@ -88,6 +94,14 @@ class Laz(Las):
     suffixes: ClassVar[tuple[str, ...]] = (".laz",)
     media_type = "application/vnd.laszip"
     is_compressed = True
+
+
+def _records(header: LasHeader) -> tuple[str, ...]:
+    """Name the records that say something of the cloud: its reference system, for one."""
+    ids = {(r.user_id, r.record_id): None for r in header.records}  # in their order, each once
+    said = [id for id in ids if id not in (LASZIP_ID, EXTRA_BYTES_ID)]
+    names = [f"record {user.decode('ascii', 'replace')} {record}" for user, record in said]
+    return (*names, *(["extended records"] if header.first_extended is not None else []))
 
 
 def _laid_out(raw: bytes) -> tuple[bytes, LasHeader, npt.NDArray[np.uint8]]:

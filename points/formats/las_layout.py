@@ -12,7 +12,7 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
 
-__all__ = ["LASZIP_ID", "LasHeader", "LasRecord", "dimensions", "read_header"]
+__all__ = ["EXTRA_BYTES_ID", "LASZIP_ID", "LasHeader", "LasRecord", "dimensions", "read_header"]
 
 LASZIP_ID = (b"laszip encoded", 22204)
 EXTRA_BYTES_ID = (b"LASF_Spec", 4)

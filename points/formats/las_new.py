@@ -14,12 +14,12 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.scalars import scalar_columns
 
-__all__ = ["new_las"]
+__all__ = ["TYPES", "new_las"]
 
 FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
-_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _RGB = ("red", "green", "blue")
 
 
@@ -29,7 +29,7 @@ def new_las(cloud: PointCloud) -> bytes:
     Attributes with the name and type of a standard dimension take its place, the others become extra bytes.
     """
     scales, offsets, integers = _quantised(cloud.xyz)
-    columns = scalar_columns(cloud.attributes, _TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
+    columns = scalar_columns(cloud.attributes, TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
     has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in _RGB)
     has_time = "gps_time" in columns and columns["gps_time"].dtype == np.float64
     point_format = 2 * has_rgb + has_time
@@ -95,7 +95,7 @@ def _extra_bytes_record(extra: dict[str, npt.NDArray[Any]]) -> bytes:
     if not extra:
         return b""
     body = b"".join(
-        struct.pack("<2xBx32s156x", _TYPES.index(values.dtype.str[1:]) + 1, name)
+        struct.pack("<2xBx32s156x", TYPES.index(values.dtype.str[1:]) + 1, name)
         for name, values in zip(_short_names(extra), extra.values(), strict=True)
     )
     return struct.pack("<H16sHH32s", 0, b"LASF_Spec", 4, len(body), b"Extra Bytes Record") + body

@@ -57,6 +57,10 @@ class Npy(Format):
         xyz = widened([rows[:, axis] for axis in range(3)])
         return PointCloud(xyz, further_columns(rows), NpySource(raw, header, xyz.copy()))
 
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name everything but the positions."""
+        return [*cloud.beside, *cloud.attributes]
+
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the array that was read with its positions replaced; a cloud of another format as (N, 3) float64."""
         source = cloud.source

@@ -21,6 +21,7 @@ MAGIC = b"\x93NUMPY"
 HEADER_BYTES = 10_000 + 12  # what numpy itself takes of a header, and what stands before it
 MAX_COLUMNS = 4096
 _FLOATS = re.compile(r"[<>=|]?f[248]")
+_PYTHON_2 = re.compile(r"(\d)L(?=[,)])")  # (400L, 3L)
 _PLAIN = re.compile(r"[<>=|]?([biufc][1-9][0-9]?|[SU][1-9][0-9]{0,4})")
 
 
@@ -69,7 +70,8 @@ def read_header(head: bytes, *, where: str) -> NpyHeader:
     check_room(begin + length, len(head), what=f"the NPY header of {where}")
     text = head[begin : begin + length]
     try:
-        entries = ast.literal_eval(text.decode("utf-8" if version == (3, 0) else "latin-1"))
+        said = text.decode("utf-8" if version == (3, 0) else "latin-1")
+        entries = ast.literal_eval(_PYTHON_2.sub(r"\1", said) if version == (1, 0) else said)
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as exc:
         raise MalformedFile(f"the NPY header of {where} is no Python literal: {text[:60]!r}") from exc
     if not isinstance(entries, dict) or set(entries) != {"descr", "fortran_order", "shape"}:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +78,13 @@ class Npz(Format):
                 found = read_header(head, where=f"array {other.filename[:80]}")
                 if found.is_attribute_of(len(xyz)):
                     attributes[_key(other)] = view(_unpacked(archive, other, found), found)
-        return PointCloud(xyz, attributes, NpzSource(raw, member.filename, array, header, xyz.copy()))
+            known = {member.filename, *(f"{name}.npy" for name in attributes)}
+            others = tuple(info.filename for info in archive.infolist() if info.filename not in known)
+        return PointCloud(xyz, attributes, NpzSource(raw, member.filename, array, header, xyz.copy()), beside=others)
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name what no array of the archive can be called."""
+        return [*cloud.beside, *(name for name, values in cloud.attributes.items() if not _is_array(name, values))]
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the archive that was read with its positions replaced; a cloud of another format as `points` and more.
@@ -179,11 +186,15 @@ def _rewrite(source: NpzSource, xyz: npt.NDArray[np.float64], path: Path) -> Non
                         target.write(block)
 
 
+def _is_array(name: str, values: npt.NDArray[Any]) -> bool:
+    return name not in KEYS and "/" not in name and not values.dtype.hasobject
+
+
 def _write_new(cloud: PointCloud, path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         arrays = {"points": np.ascontiguousarray(cloud.xyz)}
         for name, values in cloud.attributes.items():
-            if name not in KEYS and "/" not in name and not values.dtype.hasobject:
+            if _is_array(name, values):
                 arrays[name] = np.ascontiguousarray(values)
         for name, values in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: the same cloud gives the same bytes

@@ -47,6 +47,7 @@ class Pcd(Format):
     suffixes = (".pcd",)
     media_type = "application/vnd.pcl.pcd"
     writes_normals = True
+    types = _TYPES
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the comment that PCL writes, or the first keyword after comments."""
@@ -54,7 +55,7 @@ class Pcd(Format):
             return True
         lines = (line.strip() for line in head.split(b"\n"))
         first = next((line for line in lines if line and not line.startswith(b"#")), b"")
-        return first.startswith((b"VERSION ", b"FIELDS ", b"COLUMNS "))
+        return first.split()[:1] in ([b"VERSION"], [b"FIELDS"], [b"COLUMNS"])
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read all fields; those with COUNT > 1 become (N, COUNT) attributes."""

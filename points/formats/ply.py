@@ -51,6 +51,7 @@ class Ply(Format):
     suffixes = (".ply",)
     media_type = "application/vnd.ply"
     writes_normals = True
+    types = tuple(_NAMES)
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the first line."""
@@ -66,7 +67,10 @@ class Ply(Format):
         values = rows.values if isinstance(rows, AsciiRows) else _values(raw, vertex, rows)
         xyz = widened([values[axis] for axis in AXES])
         attributes = {name: value for name, value in values.items() if name not in AXES}
-        return PointCloud(xyz, attributes, PlySource(raw, begin, rows, vertex, xyz.copy()))
+        lists = [f"list {p.name}" for p in vertex.properties if p.counter is not None]
+        others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
+        source = PlySource(raw, begin, rows, vertex, xyz.copy())
+        return PointCloud(xyz, attributes, source, beside=(*lists, *others))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with its positions replaced, or a new binary one."""

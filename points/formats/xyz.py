@@ -17,7 +17,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import scalar_columns
-from straightpcf.points.formats.text import Lines, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
 
 __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
@@ -28,6 +28,7 @@ _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of whi
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+_WHOLE = np.dtype(np.int64)
 _Offsets = npt.NDArray[np.int64]
 
 
@@ -75,6 +76,7 @@ class Xyz(Format):
     media_type = "text/plain"
     has_magic = False
     delimiter: ClassVar[bytes | None] = None  # of a new file; None for a space
+    types = _TYPES
     is_counted: ClassVar[bool] = False  # a new file begins with the number of points
 
     def sniff(self, head: bytes) -> bool:
@@ -82,7 +84,7 @@ class Xyz(Format):
         return False
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read the table; further columns that hold numbers become float64 attributes."""
+        """Read the table; further columns that hold numbers become float64 attributes, or int64 where they need to."""
         raw = path.read_bytes()
         refuse_binary(raw, 0)
         layout = _layout(raw)
@@ -93,7 +95,15 @@ class Xyz(Format):
             raise MalformedFile(f"the file declares {layout.declared} points and holds {len(starts)}")
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
         attributes = {layout.names[column]: values for column, values in columns.items()}
-        return PointCloud(xyz, attributes, XyzSource(self.name, layout, raw, starts, ends, xyz.copy()))
+        texts = {*layout.names} - {*attributes} - {layout.names[axis] for axis in layout.axes}
+        source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
+        return PointCloud(xyz, attributes, source, beside=tuple(name for name in layout.names if name in texts))
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name nothing where the table that was read has the layout."""
+        source = cloud.source
+        is_kept = isinstance(source, XyzSource) and self._has_layout(source.layout)
+        return [] if is_kept else super().left_behind(cloud)
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with the moved positions replaced, or a new one if it is laid out otherwise."""
@@ -170,12 +180,10 @@ def _is_number(word: bytes) -> bool:
     return True
 
 
-def _table(
-    raw: bytes, layout: Layout, max_points: int
-) -> tuple[_Offsets, _Offsets, dict[int, npt.NDArray[np.float64]]]:
+def _table(raw: bytes, layout: Layout, max_points: int) -> tuple[_Offsets, _Offsets, dict[int, npt.NDArray[Any]]]:
     """Return the (N, 3) starts and ends of the position tokens, and every column that holds only numbers."""
     starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
-    parts: dict[int, list[npt.NDArray[np.float64]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
+    parts: dict[int, list[npt.NDArray[Any]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
     line, count = layout.line, 0
     for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter, longest=MAX_LINE_BYTES):
         rows = np.flatnonzero(_is_row(lines))
@@ -187,7 +195,9 @@ def _table(
             token = table.first + column
             values, bad = as_numbers(raw, table.starts[token], table.ends[token])
             if bad is None:
-                parts[column].append(values)
+                exact = column not in layout.axes and _is_beyond_doubles(values)
+                whole, bad = as_integers(raw, table.starts[token], table.ends[token], _WHOLE) if exact else (values, 0)
+                parts[column].append(whole if bad is None else values)
             elif column in layout.axes:
                 text = raw[table.starts[token[bad]] : table.ends[token[bad]]]
                 raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number")
@@ -196,8 +206,25 @@ def _table(
         tokens = table.first[:, None] + np.array(layout.axes)
         starts.append(table.starts[tokens])
         ends.append(table.ends[tokens])
-    columns = {column: np.concatenate(values) for column, values in parts.items()}
+    columns = {column: _joined(values) for column, values in parts.items()}
     return np.concatenate(starts), np.concatenate(ends), columns
+
+
+def _is_beyond_doubles(values: npt.NDArray[np.float64]) -> bool:
+    """Say of (K,) numbers whether they are whole and some too large for float64 to tell from the next: times, ids."""
+    return bool(np.isfinite(values).all() and (np.abs(values) >= 2**53).any() and (values == np.rint(values)).all())
+
+
+def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Join the blocks of a column: int64 where one is and the others can be, else float64."""
+    has_whole = any(part.dtype == _WHOLE for part in parts)
+    if has_whole and all(part.dtype == _WHOLE or _is_whole(part) for part in parts):
+        return np.concatenate([part.astype(_WHOLE) for part in parts])
+    return np.concatenate([part.astype(np.float64) for part in parts])
+
+
+def _is_whole(part: npt.NDArray[np.float64]) -> bool:
+    return bool((np.abs(part) < 2**53).all() and (part == np.rint(part)).all())
 
 
 def _is_row(lines: Lines) -> npt.NDArray[np.bool_]:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["denoise_file"]
 
 PREVIEW_POINTS = 256
+_NAMED = 10  # of what a conversion leaves behind
 
 OnProgress = Callable[[float, int], None]
 OnPreview = Callable[[int, list[int], list[list[float]]], None]
@@ -89,7 +90,7 @@ def denoise_file(
         device=denoiser.device,
         bytes=size,
         sha256=sha256,
-        warnings=result.warnings,
+        warnings=(*result.warnings, *_left_behind(clean, source_format, target_format)),
     )
 
 
@@ -146,13 +147,26 @@ def _check_normals(cloud: PointCloud, target: Format) -> None:
         raise UnsupportedCloud(f"normals=recompute is for {able}; the result would be {target.name}")
 
 
+def _left_behind(cloud: PointCloud, source: Format, target: Format) -> list[str]:
+    lost = [] if source is target else target.left_behind(cloud)
+    if not lost:
+        return []
+    some = ", ".join(name[:80] for name in lost[:_NAMED]) + (f" and {len(lost) - _NAMED} more" if lost[_NAMED:] else "")
+    return [f"{target.name} has no place for what else the {source.name} file holds: {some}"]
+
+
 def _displacement(before: npt.NDArray[np.float64], after: npt.NDArray[np.float64]) -> dict[str, float]:
     with np.errstate(invalid="ignore"):
         x, y, z = (after - before).T
         moved = np.hypot(np.hypot(x, y), z)  # squares of huge coordinates overflow
-    moved = moved[np.isfinite(moved)]
+    moved = moved[np.isfinite(before).all(axis=1)]
+    if not np.isfinite(moved).all():
+        largest = np.abs(before[np.isfinite(before)]).max()
+        raise UnsupportedCloud(
+            f"coordinates of up to {largest:.3g} lead out of the range of float64 when they are moved"
+        )
     p50, p90, p99, most = (float(value) for value in np.percentile(moved, [50, 90, 99, 100]))
-    return {"p50": p50, "p90": p90, "p99": p99, "max": most, "mean": float(moved.mean())}
+    return {"p50": p50, "p90": p90, "p99": p99, "max": most, "mean": float((moved / len(moved)).sum())}
 
 
 def _settle(path: Path) -> tuple[int, str]:

@@ -52,6 +52,24 @@ def test_a_link_stays_one_and_what_it_points_to_is_replaced(tmp_path: Path) -> N
     assert (elsewhere / "none.ply").read_bytes() == b"first"
 
 
+def test_a_name_may_be_as_long_as_the_file_system_lets_it(tmp_path: Path) -> None:
+    write(path := tmp_path / f"{'点' * 83}.xyz", b"new")  # 253 bytes
+    assert path.read_bytes() == b"new"
+
+
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path) -> None:
+    (loop := tmp_path / "loop.ply").symlink_to("loop.ply")
+    (lost := tmp_path / "lost.ply").symlink_to("none/real.ply")
+    for path, said in ((loop, r"loop\.ply"), (lost, r"lost\.ply is a link to none/real\.ply")):
+        with pytest.raises(OSError, match=said):
+            check_target(path)
+
+
+def test_a_disk_that_is_full_is_told_with_the_place(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"a\.ply"), replaced_when_complete(tmp_path / "a.ply"):
+        Path("/dev/full").write_bytes(b"no room")
+
+
 def test_a_block_that_fails_changes_and_leaves_nothing(tmp_path: Path) -> None:
     (path := tmp_path / "a.ply").write_bytes(b"old")
     with suppress(KeyboardInterrupt), replaced_when_complete(path) as unfinished:

@@ -123,6 +123,37 @@ def test_text_on_stdin_is_known_by_the_name_that_is_given(server: RunningServer,
     assert b"error [unknown_format]: the cloud begins with" in done.stderr
 
 
+@pytest.mark.parametrize(("closed", "arguments"), [("<&-", "- OUT.npy --name a.npy"), (">&-", "IN - --iterations 1")])
+def test_a_stream_that_is_closed_is_an_error_of_one_line(scan: Path, closed: str, arguments: str) -> None:
+    words = arguments.replace("IN", str(scan)).replace("OUT", str(scan.with_name("out")))
+    line = f"{sys.executable} -m straightpcf.clients.cli denoise {words} {closed}"
+    done = subprocess.run(["/bin/sh", "-c", line], stderr=subprocess.PIPE, env=clean_environment(), check=False)
+    assert (done.returncode, done.stderr.count(b"\n")) == (3, 1)
+    assert b"error [invalid_request]: std" in done.stderr
+
+
+def test_a_result_is_not_called_what_it_is_not(server: RunningServer, tmp_path: Path) -> None:
+    np.savetxt(scan := tmp_path / "scan.xyz", noisy(torus(POINTS), 0.01))
+    id = cli(server, "submit", scan, "--iterations", 1).stdout.decode().strip()
+    done = cli(server, "result", id, tmp_path / "r.ply")
+    assert (done.returncode, done.stderr.count(b"\n")) == (3, 1)
+    assert b"the result is xyz, and r.ply is a name for ply" in done.stderr
+    assert list(tmp_path.iterdir()) == [scan]
+    assert cli(server, "result", id, tmp_path / "r.txt").returncode == 0
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_the_suffix_of_the_target_says_what_is_written(server: RunningServer, tmp_path: Path, remote: bool) -> None:
+    where = ("--url", server.url) if remote else ("--device", "cpu")
+    rows = "".join(f"{x:f},{y:f},{z:f},tree\n" for x, y, z in noisy(torus(POINTS), 0.01))
+    (scan := tmp_path / "scan.csv").write_text("x,y,z,kind\n" + rows)
+    done = cli(None, "denoise", scan, tmp_path / "a.pcd", "--iterations", 1, *where)
+    assert b"warning: pcd has no place for what else the csv file holds: kind" in done.stderr
+    (tmp_path / "a.pcd").rename(misnamed := tmp_path / "a.ply")
+    assert cli(None, "denoise", misnamed, tmp_path / "b.ply", "--iterations", 1, *where).returncode == 0
+    assert (tmp_path / "b.ply").read_bytes().startswith(b"ply\n")
+
+
 def test_submit_takes_text_from_stdin_with_its_name(server: RunningServer) -> None:
     text = b"".join(b"%f %f %f\n" % tuple(point) for point in noisy(torus(POINTS), 0.01))
     id = cli(server, "submit", "-", "--name", "piped.txt", "--iterations", 1, stdin=text).stdout.decode().strip()
@@ -132,7 +163,7 @@ def test_submit_takes_text_from_stdin_with_its_name(server: RunningServer) -> No
     assert cli(server, "submit", "a.xyz", "b.xyz", "--name", "c.xyz").returncode == 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_denoise_that_is_ended_takes_its_job_along(server: RunningServer, tmp_path: Path, number: int) -> None:
     np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
     command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]

@@ -85,6 +85,11 @@ def test_an_array_comes_back_as_an_array_of_its_dtype_and_frame(client: Client, 
     assert result.request_id
 
 
+def test_positions_of_an_array_of_more_columns_are_three(client: Client, tmp_path: Path) -> None:
+    np.save(path := tmp_path / "wide.npy", np.hstack([noisy(torus(POINTS), 0.01), np.ones((POINTS, 3))]))
+    assert client.denoise(path, iterations=1).xyz.shape == (POINTS, 3)
+
+
 def test_path_bytes_and_array_give_the_same_points(client: Client, scan: Path, tmp_path: Path) -> None:
     target = tmp_path / "clean.npy"
     by_path = client.denoise(scan, target, iterations=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -139,6 +140,34 @@ def copy_bytes(source: socket.socket, sink: socket.socket) -> None:
     with suppress(OSError), sink:
         while data := source.recv(65536):
             sink.sendall(data)
+
+
+def test_a_link_to_itself_is_no_cloud(folder: Path) -> None:
+    (folder / "loop.ply").symlink_to("loop.ply")
+    assert once(folder) == ["first"]
+
+
+def test_a_full_disk_is_tried_again_when_more_of_it_is_free(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = 100
+    monkeypatch.setattr(watch.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    asked: list[int] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(free)
+        if free < 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert isinstance(next(outcomes), OSError)
+
+    def tidied() -> None:
+        nonlocal free
+        free = 5000
+
+    threading.Timer(0.3, tidied).start()
+    assert next(outcomes) == "first"
+    assert asked == [100, 5000]
 
 
 def test_a_file_that_fails_is_tried_again_only_when_it_changes(folder: Path) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
-from straightpcf.points.errors import DeviceUnavailable, JobCanceled, TooFewPoints
+from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, far_group, noisy, sphere, torus
 
@@ -134,6 +134,23 @@ def test_strength_scales_the_displacement(tiny: Filter) -> None:
     none = tiny.denoise(cloud, DenoiseOptions(iterations=1, strength=0)).xyz
     np.testing.assert_allclose(half, full / 2, atol=1e-12)
     assert none.tobytes() == cloud.tobytes()
+
+
+def test_numbers_of_any_type_are_taken(tiny: Filter) -> None:
+    single = noisy(torus(300), 0.01).astype(np.float32)
+    expected = tiny.denoise(single.astype(np.float64), ONE_PASS).xyz
+    assert expected.dtype == np.float64
+    for same in (single, single.tolist(), single[::-1][::-1]):
+        np.testing.assert_array_equal(tiny.denoise(same, ONE_PASS).xyz, expected)
+    assert tiny.denoise((1000 * single).astype(np.int64), ONE_PASS).xyz.shape == (300, 3)
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros((100, 2)), np.zeros(300), np.full((100, 3), "a"), np.zeros((100, 3), complex)]
+)
+def test_what_is_no_array_of_positions_is_refused_by_its_class(tiny: Filter, bad: np.ndarray) -> None:
+    with pytest.raises(InvalidCloud, match=r"must be \(N, 3\) numbers, got"):
+        tiny.denoise(bad)
 
 
 @pytest.mark.parametrize("count", [0, 1, 10, MIN_POINTS - 1])

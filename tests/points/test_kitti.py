@@ -60,6 +60,11 @@ def test_only_the_suffix_says_that_a_file_is_a_frame(frame: Path) -> None:
         read_cloud(frame.rename(frame.with_name("frame")))
 
 
+def test_a_sweep_of_five_numbers_a_point_is_no_frame(frame: Path) -> None:
+    with pytest.raises(UnsupportedCloud, match=r"nuScenes sweep has five float32 a point"):
+        read_cloud(frame.rename(frame.with_name("sweep.pcd.bin")))
+
+
 def test_a_position_that_float32_cannot_hold_is_named(frame: Path) -> None:
     cloud, format = read_cloud(frame)
     with pytest.raises(UnsupportedCloud, match=r"1e\+39 does not fit into float32"):

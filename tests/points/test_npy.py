@@ -48,6 +48,12 @@ def test_type_shape_and_memory_order_are_kept(shape: tuple[int, int], dtype: str
     np.testing.assert_array_equal(after[:, 3:], array[:, 3:])
 
 
+def test_a_shape_as_python_2_wrote_it_is_read(tmp_path: Path) -> None:
+    raw = npy(torus(5)).replace(b"(5, 3)", b"(5L, 3L)").replace(b"}  ", b"}", 1)
+    assert len(raw) == len(npy(torus(5)))
+    np.testing.assert_array_equal(read(tmp_path, raw).xyz, torus(5))
+
+
 def test_bytes_after_the_array_are_kept(tmp_path: Path) -> None:
     raw = npy(torus(5)) + npy(np.arange(3))
     assert written(tmp_path, read(tmp_path, raw), "npy") == raw

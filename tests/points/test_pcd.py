@@ -42,6 +42,11 @@ def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None
     assert _written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"4 5 6 8", b"4 5 6.5 8")
 
 
+def test_keywords_may_stand_before_tabs(tmp_path: Path) -> None:
+    raw = HEADER.replace(b"# made by hand\n", b"").replace(b" ", b"\t") + b"1 2 3 7\n4 5 6 8\n7 8 9 9\n"
+    assert _read(tmp_path, raw).xyz[2].tolist() == [7, 8, 9]
+
+
 def test_old_files_have_columns_of_float32_and_a_number_of_points(tmp_path: Path) -> None:
     raw = b"COLUMNS x y z w\nPOINTS 3\nDATA ascii\n1 2 3 7\n4 5 6 8\n7 8 9 9\n"
     (path := tmp_path / "old").write_bytes(raw)

@@ -1,0 +1,75 @@
+"""What another format cannot hold of a cloud is named, and everything else arrives."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import MissingDependency, UnsupportedCloud
+from straightpcf.points.formats import FORMATS, Format, format_named, read_cloud, write_cloud
+from tests.points.samples import SAMPLES, torus
+
+LARGE = np.array([1700000000123456789, 4611686018427387905, -9007199254740993])
+
+
+def converted(cloud: PointCloud, name: str, tmp_path: Path) -> PointCloud:
+    target = format_named(name)
+    write_cloud(cloud, tmp_path / f"out{target.suffixes[0]}", target)
+    return read_cloud(tmp_path / f"out{target.suffixes[0]}")[0]
+
+
+def columns(cloud: PointCloud, name: str) -> npt.NDArray[np.generic]:
+    """Return an attribute, or the columns that one of several became, (N, M); `extra_` is beside a LAS dimension."""
+    label = re.escape(re.sub(r"[^A-Za-z0-9_.\-]", "_", name)[:32])
+    extra, plain = (
+        [values for key, values in cloud.attributes.items() if re.fullmatch(rf"{before}{label}(_\d+)?", key)]
+        for before in ("extra_", "")
+    )
+    return np.column_stack(extra or plain)
+
+
+@pytest.mark.parametrize("target", FORMATS, ids=lambda format: format.name)
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_every_attribute_arrives_or_is_named(sample: str, target: Format, tmp_path: Path) -> None:
+    try:
+        cloud, source = read_cloud(SAMPLES[sample](tmp_path))
+        lost = target.left_behind(cloud)
+        again = converted(cloud, target.name, tmp_path)
+    except (MissingDependency, UnsupportedCloud) as refused:  # NaN in LAS
+        pytest.skip(refused.message)
+    for name, values in cloud.attributes.items() if source is not target else ():
+        if name not in {re.sub(r" \(rounded to .*\)$", "", some) for some in lost}:
+            found = columns(again, name).astype(values.dtype)  # of a text, the number that it is the shortest of
+            np.testing.assert_allclose(found, values.reshape(len(cloud), -1), rtol=1e-6 * (target.name == "kitti"))
+
+
+@pytest.mark.parametrize(
+    ("target", "is_held"), [("pcd", True), ("las", True), ("npz", True), ("csv", True), ("ply", False)]
+)
+def test_whole_numbers_of_64_bits_arrive_as_they_are_or_are_named(target: str, is_held: bool, tmp_path: Path) -> None:
+    cloud = PointCloud(torus(3), {"stamp": LARGE, "id": np.arange(3)})
+    assert format_named(target).left_behind(cloud) == ([] if is_held else ["stamp (rounded to float64)"])
+    again = converted(cloud, target, tmp_path).attributes
+    np.testing.assert_array_equal(again["stamp"], LARGE if is_held else LARGE.astype(np.float64))
+    np.testing.assert_array_equal(again["id"], np.arange(3))
+
+
+def test_columns_of_text_faces_and_records_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x,y,z,kind,w\n1,2,3,tree,7\n")
+    table = read_cloud(tmp_path / "a.csv")[0]
+    assert format_named("ply").left_behind(table) == ["kind"]
+    assert format_named("csv").left_behind(table) == []
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        "property list uchar int seen\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "1 2 3 1 5\n3 0 0 0\n"
+    )
+    assert format_named("pcd").left_behind(read_cloud(tmp_path / "a.ply")[0]) == ["list seen", "element face"]
+    colours = PointCloud(torus(2), {"red": np.arange(2, dtype=np.uint8), "intensity": np.ones(2, np.float32)})
+    assert format_named("kitti").left_behind(colours) == ["red"]
+    assert format_named("npy").left_behind(colours) == ["red", "intensity"]
