@@ -260,6 +260,7 @@ def train(
     processes: Annotated[int, typer.Option(min=1, help="On a CPU, to share each batch.")] = 1,
     init: Annotated[Path | None, typer.Option(help="The state to start from.")] = None,
     distance: Annotated[Path | None, typer.Option(help="A state whose DistanceModule to start from instead.")] = None,
+    passed: Annotated[list[Path] | None, typer.Option(help="Clouds after passes, for cvm; may be given again.")] = None,
     settled: Annotated[bool, typer.Option("--settled", help="No dropout, BatchNorm as it is: to train on.")] = False,
     minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after these, with the state saved.")] = None,
 ) -> None:
@@ -284,6 +285,7 @@ def train(
             processes=processes,
             init=init,
             distance=distance,
+            passed=passed or (),
             settled=settled,
             minutes=minutes,
             on_step=lambda step: show(step.iteration / step.iterations, f"loss {step.loss:.3e}"),

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,7 @@ __all__ = [
     "NEAR_WEIGHT",
     "NOISE_STD",
     "OTHER_NOISE",
+    "PASSED",
     "PATCH_SIZE",
     "REACH",
     "SCALES",
@@ -37,10 +39,13 @@ __all__ = [
     "UNEQUAL",
     "VALIDATION_EVERY",
     "Batch",
+    "Patch",
     "PatchSource",
     "Surface",
+    "drawn_noise",
     "gathered",
     "held_out_shapes",
+    "near_first",
     "reach_of",
 ]
 
@@ -51,6 +56,8 @@ SCALES = (0.8, 1.2)  # augmentation
 # The share of patches shown as the first pass of the filter shows them: with noise of 0 to 3 % of the cloud's radius,
 # in the size that goes with it (`zoom_of`). The others are shown as later passes see them, with t in [0, 1).
 FIRST_PASSES = 0.5
+# The share of patches that are of clouds after passes (`passed`), where there are such, at the cost of the others.
+PASSED = 0.25
 # Somewhat smaller than the filter shows them: training with more noise than this loses thin walls (docs/training.md).
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
 # The share of patches whose noise is not the paper's. Of these, some are heavy-tailed: each point's variance is drawn
@@ -75,6 +82,8 @@ AROUND, REACH = 6000, 1.5
 # Until then what is across the surface is aimed at the surface itself; later it is known no better than the points are.
 TOUCH_UNTIL = 0.98
 
+Patch = tuple[npt.NDArray[np.float64], ...]  # what a `Batch` has of one
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -84,7 +93,8 @@ class Batch:
     surface y is on the plane that touches it where x_t is nearest (`Surface.touching`), and x_0 on the line from there
     through x_t. drawn: (B, P, 3) float32, y before that, the clean points themselves; surface, normals: (B, M, 3)
     float32, points of the surface around the patch and their unit normals: for y where another place than x_t counts
-    (`touching`).
+    (`touching`). passed: (B, 1, 1) float32, 1 for a patch of a cloud after passes, of which x_t is what is known, and
+    where it is to go only across the surface.
     """
 
     noisy: torch.Tensor
@@ -93,6 +103,7 @@ class Batch:
     drawn: torch.Tensor
     surface: torch.Tensor
     normals: torch.Tensor
+    passed: torch.Tensor
 
     def at(self, time: torch.Tensor) -> torch.Tensor:
         """Return x_t = (1 - t) x_0 + t y, (B, P, 3)."""
@@ -117,7 +128,7 @@ class Batch:
         return clean + ((foot - clean) * normal).sum(dim=2, keepdim=True) * normal
 
     def _tensors(self) -> tuple[torch.Tensor, ...]:
-        return self.noisy, self.clean, self.time, self.drawn, self.surface, self.normals
+        return self.noisy, self.clean, self.time, self.drawn, self.surface, self.normals, self.passed
 
 
 @dataclass(frozen=True)
@@ -165,6 +176,13 @@ def held_out_shapes(names: Iterable[str]) -> set[str]:
     return set(shapes[VALIDATION_EVERY // 2 :: VALIDATION_EVERY])
 
 
+class PatchMaker(Protocol):
+    """Draw patches of a kind of its own."""
+
+    def patch(self, rng: np.random.Generator) -> Patch:
+        """Draw one; all randomness comes from `rng`."""
+
+
 class PatchSource:
     """Draw patches from clean clouds, each in the frame where its bounding sphere has radius 1."""
 
@@ -192,6 +210,7 @@ class PatchSource:
                 frame = CloudFrame.of(wide)
                 self.clouds.append(frame.enter(wide))
                 self.surfaces.append(Surface(frame.enter(finest), across))
+        self.passed: PatchMaker | None = None  # draws patches of clouds after passes
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
         self.zooms = np.stack([self._zooms(cloud, tree) for cloud, tree in zip(self.clouds, self._trees, strict=True)])
 
@@ -227,32 +246,34 @@ class PatchSource:
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""
-        patches = [self._patch(rng, augment=augment) for _ in range(batch_size)]
+        patches = []
+        for _ in range(batch_size):
+            if augment and self.passed is not None and rng.random() < PASSED:
+                patches.append(self.passed.patch(rng))
+            else:
+                patches.append(self._patch(rng, augment=augment))
         return Batch(*(torch.from_numpy(np.stack(part).astype(np.float32)) for part in zip(*patches, strict=True)))
 
-    def _patch(self, rng: np.random.Generator, *, augment: bool) -> tuple[npt.NDArray[np.float64], ...]:
+    def _patch(self, rng: np.random.Generator, *, augment: bool) -> Patch:
         which = int(rng.integers(len(self.clouds)))
         cloud, tree = self.clouds[which], self._trees[which]
         seed = cloud[rng.integers(len(cloud))]
         _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
         clean = cloud[near]  # row 0 is the seed
         scale = rng.uniform(*SCALES) if augment else 1.0
-        if rng.random() < FIRST_PASSES:
+        if rng.random() < (FIRST_PASSES if self.passed is None else FIRST_PASSES / (1 - PASSED)):
             level = rng.integers(len(FIRST_NOISE))
             scale *= self.zooms[which, level]
             time = max(EARLIEST, 1 - scale * FIRST_NOISE[level] / NOISE_STD)
         else:
             time = rng.uniform(0, 1)
-        here = clean + (1 - time) * NOISE_STD / scale * _noise(rng, len(clean))
+        here = clean + (1 - time) * NOISE_STD / scale * drawn_noise(rng, len(clean))
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
         distance = np.square(here - origin).sum(axis=1)
         inside = np.argsort(distance)[:PATCH_SIZE]
         transform = scale * (Rotation.random(random_state=rng).as_matrix() if augment else np.eye(3))
-        # A weighted draw without replacement: the smallest of exponential variables (Efraimidis and Spirakis 2006).
-        turn = rng.exponential(size=PATCH_SIZE)
-        turn[: int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
-        inside = inside[np.argsort(turn)]
+        inside = inside[near_first(rng)]
         here, clean = here[inside], clean[inside]
         drawn = clean
         surface, normals = self.surfaces[which].around(seed, REACH * PATCH_SIZE / len(cloud))
@@ -260,11 +281,20 @@ class PatchSource:
             clean = self.surfaces[which].touching(here, clean)
         noisy = (here - time * clean) / (1 - time)
         placed = [(points - origin) @ transform for points in (noisy, clean, drawn, surface)]
-        return placed[0], placed[1], np.array([[time]]), placed[2], placed[3], normals @ transform / scale
+        when, passed = np.array([[time]]), np.array([[0.0]])
+        return placed[0], placed[1], when, placed[2], placed[3], normals @ transform / scale, passed
 
 
-def _noise(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
-    """Draw noise of std 1 for the points of one patch, (count, 3): the paper's, or another (`OTHER_NOISE`)."""
+def near_first(rng: np.random.Generator) -> npt.NDArray[np.int64]:
+    """Draw an order, (PATCH_SIZE,), of points that are sorted by distance: the nearer half is likely to come first."""
+    # A weighted draw without replacement: the smallest of exponential variables (Efraimidis and Spirakis 2006).
+    turn = rng.exponential(size=PATCH_SIZE)
+    turn[: int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
+    return np.argsort(turn)
+
+
+def drawn_noise(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
+    """Draw noise of std 1 for the points of one patch or cloud, (count, 3): the paper's, or another (`OTHER_NOISE`)."""
     noise = rng.standard_normal((count, 3))
     if rng.random() >= OTHER_NOISE:
         return noise

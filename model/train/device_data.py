@@ -77,7 +77,7 @@ class DevicePatchSource:
         surface, normals = self._around(which, gathered(clouds, seeds[:, None]))
         turn = random_rotations(batch_size, device)
         noisy, here, clean, surface = ((part - origin) @ turn * scale for part in (noisy, here, clean, surface))
-        batch = Batch(noisy, clean, time, clean, surface, normals @ turn)
+        batch = Batch(noisy, clean, time, clean, surface, normals @ turn, torch.zeros_like(time))
         early = time < TOUCH_UNTIL
         touched = torch.where(early, batch.touching(here), clean)
         # Late in time x_0 stays as drawn: float32 cannot find it again from x_t.

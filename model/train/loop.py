@@ -20,6 +20,7 @@ from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
+from straightpcf.model.train.passed import training_patches
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import Average, load_state, read_network, save_state, take_distance_module
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
@@ -67,13 +68,15 @@ def train(
     minutes: float | None = None,
     init: Path | None = None,
     distance: Path | None = None,
+    passed: Sequence[Path] = (),
     settled: bool = False,
     euler_steps: int = 1,
     on_step: Callable[[TrainStep], None] | None = None,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
-    data: the archives of clean clouds (`PatchSource.read`), which a run that goes on may change.
+    data: the archives of clean clouds (`PatchSource.read`), which a run that goes on may change; passed: of stage cvm,
+    on a CPU, archives of their shapes as later passes see them (`write_passed`).
     init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage, or
     weights that ship. distance: one of these whose DistanceModule to start from instead. rows: points of a patch in the
     loss. settled: without dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The
@@ -87,6 +90,8 @@ def train(
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
+    if passed and (stage != "cvm" or device != "cpu"):
+        raise InvalidOptions(f"clouds after passes are for stage 'cvm' on a CPU, not for {stage!r} on {device!r}")
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)
@@ -108,7 +113,7 @@ def train(
     average = Average(network, _EMA_DECAY)
     start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
-    source = PatchSource.read(*archives)
+    source = training_patches(archives, passed, network.distance_module)
     stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
     if stage == "cvm":
         stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
@@ -116,7 +121,7 @@ def train(
     share = batch_size // processes
     team = None
     if processes > 1:
-        team = Team(processes - 1, network, trained, stage_loss, archives, share, (seed, start))
+        team = Team(processes - 1, network, trained, stage_loss, archives, share, (seed, start), passed=passed)
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"

@@ -16,7 +16,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import NOISE_STD, TOUCH_UNTIL, Batch
 from straightpcf.model.turns import turns
 
-__all__ = ["LAMBDA_1", "LAMBDA_2", "coupled_loss", "distance_loss", "precision", "velocity_loss"]
+__all__ = ["LAMBDA_1", "LAMBDA_2", "across", "coupled_loss", "distance_loss", "precision", "velocity_loss"]
 
 LAMBDA_1 = 10.0
 LAMBDA_2 = 200.0
@@ -24,6 +24,7 @@ _TRAJECTORIES = 0.25  # the share of a batch that L_C moves
 _UNIT = 3 * NOISE_STD**2  # the mean of |y - x_0|^2
 # Spread of the target, in units of the noise at time t, at which an error counts by half.
 _KNOWABLE = 1.0
+_ALONG = 0.02  # the weight of errors along the surface after a pass: enough that points do not wander
 _LATEST = 0.9  # the noise at time t is taken as no less than at this one: float32 covariances bear no less
 
 
@@ -57,7 +58,7 @@ def coupled_loss(network: StraightPCF, batch: Batch, rows: int, euler_steps: int
         steps.append((v, moved))
         x = moved if k == 1 else torch.cat([moved, x[:, rows:] + step * beyond], dim=1)
     target = _targets(batch, start, x, steps[-1][0][:, :rows])
-    weight = precision(batch, target.shape[1])
+    weight = across(batch, start + (1 - batch.time) * target, precision(batch, target.shape[1]))
     loss = x.new_zeros(())
     for k, (v, moved) in enumerate(steps, start=1):
         some = slice(v.shape[1])
@@ -82,6 +83,21 @@ def _targets(batch: Batch, start: torch.Tensor, end: torch.Tensor, velocity: tor
     nearest = (batch.touching(there) - start[:, :rows]) / left
     target[:, :rows] = torch.where(batch.time < TOUCH_UNTIL, nearest, target[:, :rows])
     return target
+
+
+@torch.no_grad()
+def across(batch: Batch, there: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Return the weights (B, P, 3, 3), those of clouds after passes for errors across the surface at `there` only.
+
+    Where along it a point came from is not to be told after a pass: what is left of the noise is no noise.
+    """
+    if batch.passed.is_cuda or not batch.passed.any():  # on CUDA there are none, and a graph has no branches
+        return weight
+    for patch in batch.passed.flatten().nonzero().flatten().tolist():
+        near = torch.cdist(there[patch], batch.surface[patch]).argmin(dim=1)
+        normal = batch.normals[patch][near]
+        weight[patch] = _ALONG * torch.eye(3) + (1 - _ALONG) * normal[:, :, None] * normal[:, None, :]
+    return weight
 
 
 @torch.no_grad()

@@ -13,7 +13,8 @@ from torch import multiprocessing
 
 from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train.data import Batch, PatchSource
+from straightpcf.model.train.data import Batch
+from straightpcf.model.train.passed import training_patches
 
 __all__ = ["NetworkLoss", "Team"]
 
@@ -35,6 +36,8 @@ class Team:
         data: Sequence[Path],
         batch_size: int,
         seed: tuple[int, ...],
+        *,
+        passed: Sequence[Path] = (),
     ) -> None:
         network.share_memory()
         self._parameters = list(trained.parameters())
@@ -44,7 +47,7 @@ class Team:
             ours, theirs = context.Pipe()
             gradient = torch.zeros(sum(p.numel() for p in self._parameters))
             gradient.share_memory_()  # type: ignore[no-untyped-call]
-            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number))
+            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number), passed)
             context.Process(target=_work, args=arguments, daemon=True).start()
             theirs.close()
             self._members.append((ours, gradient))
@@ -95,12 +98,13 @@ def _work(
     data: Sequence[Path],
     batch_size: int,
     seed: tuple[int, ...],
+    passed: Sequence[Path],
 ) -> None:
     torch.set_num_threads(1)
     keep_large_buffers()
     rng = np.random.default_rng(seed)
     torch.manual_seed(int(rng.integers(2**62)))  # dropout
-    source = PatchSource.read(*data)
+    source = training_patches(data, passed, network.distance_module)
     try:
         while True:
             trained.train(pipe.recv())

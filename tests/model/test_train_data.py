@@ -25,7 +25,8 @@ def drawn(source: PatchSource, count: int, *, on_device: bool) -> Batch:
 
 def batch_of(noisy: torch.Tensor, clean: torch.Tensor, time: torch.Tensor) -> Batch:
     """Make a batch of clean points (B, P, 3) that are their own surface, z upwards."""
-    return Batch(noisy, clean, time, clean, clean, torch.tensor([0.0, 0.0, 1.0]).expand_as(clean))
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(clean)
+    return Batch(noisy, clean, time, clean, clean, up, torch.zeros_like(time))
 
 
 def test_training_shapes_and_validation_shapes_are_disjoint(data: Path) -> None:
@@ -138,7 +139,7 @@ def test_noisy_points_are_led_to_the_surface_and_not_beneath_it() -> None:
     assert beneath.mean() == pytest.approx(noise**2, rel=0.1)  # H s^2
     assert abs((1 - (chosen * out).sum(axis=1)).mean()) < 0.1 * noise**2
     wide = [torch.from_numpy(part).float()[None] for part in (clean, here, *source.surfaces[0].around(ball[0], 0.3))]
-    batch = Batch(wide[1], wide[0], torch.zeros(1, 1, 1), wide[0], wide[2], wide[3])
+    batch = Batch(wide[1], wide[0], torch.zeros(1, 1, 1), wide[0], wide[2], wide[3], torch.zeros(1, 1, 1))
     assert np.abs(batch.touching(wide[1])[0].numpy() - chosen).max() < 1e-5
 
 
@@ -162,7 +163,9 @@ def test_points_between_two_walls_are_led_to_the_one_that_they_are_brought_near(
     lower, upper = (torch.cartesian_prod(side, side, torch.tensor([z]))[None] for z in (-0.03, 0.03))
     walls, up = torch.cat([lower, upper], dim=1), torch.tensor([0.0, 0.0, 1.0])
     drawn = upper[:, ::2]  # all are of the upper wall, and lie above it
-    batch = Batch(drawn + 0.01 * up, drawn, torch.zeros(1, 1, 1), drawn, walls, up.expand_as(walls))
+    batch = Batch(
+        drawn + 0.01 * up, drawn, torch.zeros(1, 1, 1), drawn, walls, up.expand_as(walls), torch.zeros(1, 1, 1)
+    )
 
     class Along(torch.nn.Module):
         """Brings every point to the same height."""
