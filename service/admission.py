@@ -7,7 +7,7 @@ from typing import Literal
 
 from straightpcf.points.errors import QuotaExceeded, ServerBusy, SpoolFull, TooManyBytes
 from straightpcf.points.wire.patches import BYTES_PER_POINT
-from straightpcf.service.jobs.store import Load
+from straightpcf.service.jobs.record import Load
 
 __all__ = ["Limits"]
 
@@ -57,15 +57,19 @@ class Limits:
         passes = _AUTO_PASSES if iterations == "auto" else iterations
         return 2 * size + min(weight, self.max_points) * passes * BYTES_PER_POINT
 
-    def check_disk(self, load: Load, free_bytes: int, *, spool: int) -> None:
-        """Raise SpoolFull if a job of `spool` bytes does not fit beside those that are kept and are still to come."""
+    def check_disk(self, load: Load, free_bytes: int, *, spool: int, written: int = 0) -> None:
+        """Raise SpoolFull if a job of `spool` bytes does not fit beside those that are kept and are still to come.
+
+        written: those of them that are on the disk already, and no part of its `free_bytes`.
+        """
         if load.bytes + spool > self.max_spool_bytes:
             raise SpoolFull(
                 f"{load.bytes} bytes of jobs are kept or to come and up to {spool} would be added; "
                 f"this server keeps {self.max_spool_bytes}"
             )
-        if free_bytes - load.coming - spool < self.min_free_bytes:
+        coming = load.coming + spool - written
+        if free_bytes - coming < self.min_free_bytes:
             raise SpoolFull(
-                f"the server's disk has {free_bytes} bytes left, of which jobs may take {load.coming + spool}; "
+                f"the server's disk has {free_bytes} bytes left, of which jobs may take {coming}; "
                 f"{self.min_free_bytes} must stay free"
             )

@@ -16,9 +16,10 @@ import uvicorn
 from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
+from starlette.routing import Route
 
 import straightpcf
-from straightpcf.points.errors import InvalidOptions, MissingDependency
+from straightpcf.points.errors import InvalidOptions, MissingDependency, SpoolFull
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
@@ -30,6 +31,8 @@ from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.folders import JobFolders
+from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
@@ -72,6 +75,9 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         summary="Hand it a noisy point cloud, get the same points back on the surface.",
         lifespan=lifespan,
     )
+    for route in app.routes:  # of the document and of /docs
+        if isinstance(route, Route) and route.methods:
+            route.methods.add("HEAD")  # as everywhere
     app.state.engine = engine
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
@@ -159,11 +165,12 @@ def _weights_name(settings: Settings) -> str:
 def _check_start(settings: Settings) -> None:
     """Raise InvalidOptions for what would otherwise end the server in the middle of its start."""
     try:
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=settings.data_dir):
-            pass
-        JobStore(settings.data_dir / "jobs.sqlite3").close()
-    except (OSError, sqlite3.Error) as exc:
+        with full_disk_as_spool_full():
+            JobFolders(settings.data_dir).close()
+            with tempfile.TemporaryFile(dir=settings.data_dir):
+                pass
+            JobStore(settings.data_dir / "jobs.sqlite3").close()
+    except (OSError, sqlite3.Error, SpoolFull) as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
         raise InvalidOptions(f"weights is {settings.weights}, which is no file")

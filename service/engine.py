@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import logging
+import sqlite3
 import time
 import uuid
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Mapping
@@ -23,10 +24,11 @@ from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE
 from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.jobs.folders import JobFolders, digest_of
-from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
-from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState
+from straightpcf.service.jobs.full_disk import full_disk_as_spool_full, is_full, keep_reserve, release_reserve
+from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState, NewJob
 from straightpcf.service.jobs.runner import JobRunner
-from straightpcf.service.jobs.store import JobStore, NewJob
+from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.jobs.sweeper import Sweeper
 
 __all__ = ["Engine", "JobRequest", "Usage"]
 
@@ -34,8 +36,9 @@ __all__ = ["Engine", "JobRequest", "Usage"]
 POLL_SECONDS = 1.0
 # Who still waits when a server ends is answered so long before what runs is cut off.
 FAREWELL_SECONDS = 1.5 * POLL_SECONDS
-SWEEP_SECONDS = 30.0
 CHUNK_BYTES = 2**20
+# What ends or deletes jobs, and so may take the reserve of a full disk.
+_MAKES_ROOM = frozenset[object]({JobStore.delete, JobStore.fail, JobStore.recover, JobStore.request_cancel})
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -80,10 +83,10 @@ class Engine:
         self._data_dir = data_dir
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="job-store")  # SQLite blocks, the event loop must not
         self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
-        self._sweeper: asyncio.Task[None] | None = None
         self._store: JobStore
         self._folders: JobFolders
         self._runner: JobRunner
+        self._sweeper: Sweeper
 
     @property
     def ready(self) -> bool:
@@ -100,10 +103,13 @@ class Engine:
             self.backend, folders=self._folders, call=self._call, notify=self._notify,
             max_points=self.limits.max_points, result_ttl_seconds=self.limits.result_ttl_seconds,
         )  # fmt: skip
-        await self._sweep()
+        self._sweeper = Sweeper(
+            self._data_dir, folders=self._folders, call=self._call, notify=self._notify,
+            result_ttl_seconds=self.limits.result_ttl_seconds, row_ttl_seconds=self.limits.row_ttl_seconds,
+        )  # fmt: skip
+        await self._sweeper.start()
         await self.backend.start()
         self._runner.start()
-        self._sweeper = asyncio.create_task(self._keep_sweeping())
 
     def drain(self) -> None:
         """Take nothing new from now on; what runs goes on."""
@@ -123,9 +129,7 @@ class Engine:
     async def stop(self) -> None:
         """Let running jobs finish for a while, put the others back into the queue, and end the backend."""
         self.drain()
-        if self._sweeper is not None:
-            self._sweeper.cancel()
-            await asyncio.wait([self._sweeper])
+        await self._sweeper.stop()
         await self._runner.stop(patience_seconds=self.patience_seconds)
         await self.backend.stop()
         await self._call(JobStore.close)
@@ -134,16 +138,20 @@ class Engine:
 
     # --- taking jobs
 
-    async def check_room(self, *, size: int = 0) -> None:
-        """Raise what would keep a job of `size` bytes from being admitted, as far as it is known before its body."""
+    async def check_room(
+        self, *, size: int = 0, owner: str = "", id: str | None = None, idempotency_key: str | None = None
+    ) -> None:
+        """Raise what would keep a job of `size` bytes from being admitted, as far as it is known before its body.
+
+        A request with an id or a key of a job that is there may be the one that made it, which takes no room.
+        """
         if self.draining:
             raise ServerBusy("the server is shutting down")
-        await self._check(size)
-
-    async def _check(self, size: int) -> None:
+        self.limits.check_bytes(size)
+        if await self._call(JobStore.has, owner, id=id, idempotency_key=idempotency_key):
+            return
         if self.backend.failure is not None:
             raise self.backend.failure
-        self.limits.check_bytes(size)
         load = await self._call(JobStore.load)
         self.limits.check_queue(load)
         self.limits.check_disk(load, self._folders.free_bytes(), spool=self.limits.spool_bytes(size))
@@ -155,10 +163,11 @@ class Engine:
     async def submit(self, source: Path, request: JobRequest) -> tuple[JobRecord, bool]:
         """Commit one job, or find the one that the same request made; return it and whether it is new.
 
-        Raises ServerBusy, SpoolFull, QuotaExceeded, TooManyBytes, UnknownFormat, IdConflict, IdempotencyConflict.
+        One that may run again is made anew, under its id. Raises ServerBusy, SpoolFull, QuotaExceeded, TooManyBytes,
+        UnknownFormat, IdConflict, IdempotencyConflict.
         """
         size = source.stat().st_size
-        await self._check(size)  # not whether it drains: what was let in before may finish
+        self.limits.check_bytes(size)
         if request.format is not None:
             format_named(request.format)  # raises before anything waits
         if request.id is not None and not JOB_ID.fullmatch(request.id):
@@ -188,20 +197,25 @@ class Engine:
         return record, created
 
     def _admit(self, store: JobStore, new: NewJob, source: Path) -> tuple[JobRecord, bool]:
-        if (known := store.match(new)) is not None:
+        known = store.match(new)
+        if known is not None and not known.may_run_again:
             return known, False
-        load = store.load()
+        if self.backend.failure is not None:
+            raise self.backend.failure
+        load = store.load()  # not whether it drains: what was let in before may finish
         self.limits.check_queue(load, weight=new.weight)
         self.limits.check_key(store.load(new.owner))
-        self.limits.check_disk(load, self._folders.free_bytes(), spool=new.spool)
+        self.limits.check_disk(load, self._folders.free_bytes(), spool=new.spool, written=new.bytes)
         created = False
         try:
             self._folders.adopt(source, new.folder)
             record, created = store.create(new)
-            return record, created
         finally:
             if not created:  # another server was quicker, or the disk is full
                 self._folders.remove(new.folder)
+        if created and known is not None:
+            self._folders.remove(known.folder)
+        return record, created
 
     # --- telling about jobs
 
@@ -293,6 +307,7 @@ class Engine:
         record = await self.cancel(id, owner=owner)
         await self._call(JobStore.delete, id)
         await asyncio.to_thread(self._folders.remove, record.folder)
+        await asyncio.to_thread(keep_reserve, self._data_dir)
         self._notify(id)
 
     # --- inside
@@ -300,16 +315,24 @@ class Engine:
     async def _call(self, function: Callable[Concatenate[JobStore, _P], _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Run one store transaction on the store's thread; it is carried out even if the caller is cancelled.
 
-        Raises SpoolFull where the disk is full.
+        Raises SpoolFull where the disk is full; what makes room there takes the reserve.
         """
-        loop = asyncio.get_running_loop()
+
+        def carry_out() -> _T:
+            try:
+                return function(self._store, *args, **kwargs)
+            except sqlite3.Error as exc:
+                if not (function in _MAKES_ROOM and is_full(exc) and release_reserve(self._data_dir)):
+                    raise
+                return function(self._store, *args, **kwargs)
+
         with full_disk_as_spool_full():
-            return await loop.run_in_executor(self._thread, lambda: function(self._store, *args, **kwargs))
+            return await asyncio.get_running_loop().run_in_executor(self._thread, carry_out)
 
     async def _further(self, news: asyncio.Event, seconds: float = POLL_SECONDS) -> None:
         """Return when there may be something new; raises ServerBusy when this server is about to end."""
         if self.draining and self.patience_seconds < min(FAREWELL_SECONDS, self.limits.shutdown_seconds / 2):
-            raise ServerBusy("the server is shutting down; the job goes on when it is back")
+            raise ServerBusy("the server is shutting down; a job goes on when it is back, unless it ends with its call")
         await _first(news, seconds)
 
     def _news_of(self, id: str) -> asyncio.Event:
@@ -322,26 +345,6 @@ class Engine:
     def _notify(self, id: str) -> None:
         if (news := self._news.pop(id, None)) is not None:
             news.set()
-
-    async def _keep_sweeping(self) -> None:
-        while True:
-            await asyncio.sleep(SWEEP_SECONDS)
-            try:
-                await self._sweep()
-            except Exception:
-                logger.exception("a sweep of the job store failed; another follows")
-
-    async def _sweep(self) -> None:
-        """Take back what died, expire what is old, remove what nobody owns."""
-        servers = await self._call(JobStore.servers)
-        dead = await asyncio.to_thread(self._folders.dead_servers, servers - {self._folders.server})
-        for id in await self._call(JobStore.recover, dead, expires_in=self.limits.result_ttl_seconds):
-            logger.warning("nobody worked on job %s any more: a server died, or could not write", id)
-            self._notify(id)
-        gone = await self._call(JobStore.expire, rows_after=self.limits.row_ttl_seconds)
-        gone += await self._call(JobStore.unknown, await asyncio.to_thread(self._folders.orphans))
-        for folder in gone:
-            await asyncio.to_thread(self._folders.remove, folder)
 
 
 async def _first(news: asyncio.Event, seconds: float) -> None:

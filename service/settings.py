@@ -94,13 +94,19 @@ class Settings:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
 
     def keys(self) -> tuple[str, ...]:
-        """Return the API keys; raises InvalidOptions for a key that no header carries, and for a file without any."""
+        """Return the API keys; raises InvalidOptions for a key that no header carries, and where none is left.
+
+        Only in a file does "#" begin a comment.
+        """
         found = _usable_keys(self.api_keys.split(","), "api_keys")
+        if self.api_keys.strip() and not found:
+            raise InvalidOptions("api_keys holds no key; leave it out for a server that asks for none")
         if self.api_keys_file is not None:
             try:
                 lines = self.api_keys_file.read_text().splitlines()
             except (OSError, UnicodeDecodeError) as exc:
                 raise InvalidOptions(f"api_keys_file {self.api_keys_file}: {exc}") from exc
+            lines = [line for line in lines if not line.lstrip().startswith("#")]
             found += _usable_keys(lines, f"api_keys_file {self.api_keys_file}")
             if not found:
                 raise InvalidOptions(f"api_keys_file {self.api_keys_file} holds no key")
@@ -131,8 +137,8 @@ def _is_of_others(variable: str, text: str) -> bool:
 
 
 def _usable_keys(texts: Iterable[str], setting: str) -> list[str]:
-    """Leave out blanks and comments; the error must not tell the key, for it ends in a log."""
-    keys = [key for key in map(str.strip, texts) if key and not key.startswith("#")]
+    """Leave out blanks; the error must not tell the key, for it ends in a log."""
+    keys = [key for key in map(str.strip, texts) if key]
     for number, key in enumerate(keys, 1):
         if not (key.isascii() and key.isprintable()):
             raise InvalidOptions(f"{setting}: key {number} of {len(keys)} is not printable ASCII; no header carries it")

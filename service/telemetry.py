@@ -18,6 +18,8 @@ from straightpcf.service.jobs.record import STATES
 
 __all__ = ["MetricsMiddleware", "Telemetry"]
 
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+
 
 class Telemetry:
     """Count requests, and read the engine when someone asks."""
@@ -68,7 +70,7 @@ class _EngineCollector(Collector):
 
 
 class MetricsMiddleware:
-    """Measure every request; routes, not paths, so that there are few labels."""
+    """Measure every request; routes, not paths, and known methods, so that there are few labels."""
 
     def __init__(self, app: ASGIApp, *, telemetry: Telemetry) -> None:
         self._app, self._telemetry = app, telemetry
@@ -90,5 +92,6 @@ class MetricsMiddleware:
             await self._app(scope, receive, send_and_see)
         finally:
             route = getattr(scope.get("route"), "path", "none")
-            self._telemetry.requests.labels(scope["method"], route, status).inc()
-            self._telemetry.seconds.labels(scope["method"], route).observe(time.monotonic() - began)
+            method = scope["method"] if scope["method"] in _METHODS else "other"
+            self._telemetry.requests.labels(method, route, status).inc()
+            self._telemetry.seconds.labels(method, route).observe(time.monotonic() - began)

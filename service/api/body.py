@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from straightpcf.points.errors import InvalidOptions, InvalidRequest, UnknownFormat
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, ServerBusy, UnknownFormat
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.disposition import disposition_name
+from straightpcf.service.engine import FAREWELL_SECONDS, Engine
 
-__all__ = ["SpoolFile", "Upload", "declared_size", "receive_upload"]
+__all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "receive_upload"]
 
 FILE_FIELD = "file"
 MAX_FIELDS = 20
 MAX_FIELD_BYTES = 1024
 WRITE_BYTES = 2**20
+LOOK_SECONDS = 0.25
+
+_T = TypeVar("_T")
 
 
 @dataclass
@@ -40,11 +45,30 @@ def declared_size(request: Request) -> int:
 async def receive_upload(request: Request, target: Path, *, limits: Limits) -> Upload:
     """Write the request's file to `target`: a form's part named "file", or any other body as it is.
 
-    Raises TooManyBytes, UnknownFormat, InvalidRequest; ClientDisconnect if the client goes away.
+    Raises TooManyBytes, UnknownFormat, InvalidRequest, ServerBusy; ClientDisconnect if the client goes away.
     """
-    coding = request.headers.get("content-encoding", "identity")
-    if coding.strip().lower() not in ("", "identity"):
+    coding = ",".join(request.headers.getlist("content-encoding"))
+    if any(each.strip().lower() not in ("", "identity") for each in coding.split(",")):
         raise UnknownFormat(f"the body is encoded as {coding[:40]!r}; send it as it is")
+    return await in_time(request.app.state.engine, _receive(request, target, limits))
+
+
+async def in_time(engine: Engine, receiving: Coroutine[Any, Any, _T]) -> _T:
+    """Return what a body that comes in is; raises ServerBusy a moment before this server ends, and reads no further."""
+    task = asyncio.ensure_future(receiving)
+    farewell = min(FAREWELL_SECONDS, engine.limits.shutdown_seconds / 2)
+    try:
+        while not task.done():
+            if engine.draining and engine.patience_seconds < farewell:
+                raise ServerBusy("the server is shutting down, and the body has not come to its end")
+            await asyncio.wait([task], timeout=LOOK_SECONDS)
+        return task.result()
+    finally:
+        task.cancel()
+        await asyncio.wait([task])  # it writes to a file that is about to be removed
+
+
+async def _receive(request: Request, target: Path, limits: Limits) -> Upload:
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     with await asyncio.to_thread(target.open, "wb") as file:
         spool = SpoolFile(file)

@@ -5,46 +5,74 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import os
 import re
 import secrets
 from collections.abc import AsyncIterator
-from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
-from straightpcf.points.errors import RangeNotSatisfiable
+from straightpcf.points.errors import JobExpired, RangeNotSatisfiable
 from straightpcf.service.api.errors import problem_response
+from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord
 
-__all__ = ["report_and_file", "result_response"]
+__all__ = ["open_result", "report_and_file", "result_response"]
 
 _RANGE = re.compile(r"(\d{1,18})-(\d{0,18})|()-(\d{1,18})")  # no file needs more digits
 _CONDITIONAL = frozenset({"GET", "HEAD"})  # what another method made or did is sent whole
 _CHUNK_BYTES = 2**18
 
 
+async def open_result(engine: Engine, id: str, *, owner: str) -> tuple[IO[bytes], JobRecord]:
+    """Open a job's result: what is open is sent whole, whoever deletes it meanwhile. Raises as `Engine.result` does."""
+    path, record = await engine.result(id, owner=owner)
+    try:
+        file = await asyncio.to_thread(path.open, "rb")
+    except FileNotFoundError as exc:
+        await engine.result(id, owner=owner)  # raises what has become of the job
+        raise JobExpired(f"the result of job {id} has been removed") from exc
+    return file, record
+
+
 def result_response(
-    request: Request, path: Path, record: JobRecord, *, after: BackgroundTask | None = None
+    request: Request, file: IO[bytes], record: JobRecord, *, after: BackgroundTask | None = None
 ) -> Response:
-    """Send a job's result, or the part of it that a GET asks for; `after` runs when it is sent."""
+    """Send a job's result, or the part of it that a GET asks for, and close it; `after` runs when it is sent."""
     assert record.result is not None
     headers, size = {**result_headers(record), "Accept-Ranges": "bytes"}, record.result.bytes
     parts: list[str] = []
     if request.method in _CONDITIONAL:
         if _matches(request.headers.get("if-none-match"), headers["ETag"]):
+            file.close()
             return Response(status_code=304, headers={"ETag": headers["ETag"]}, background=after)
         asked = _ranges(request, headers["ETag"])
         parts = [f"{first}-{last}" for first, last in asked if (int(first) < size if first else int(last) > 0)]
         if asked and not parts:
+            file.close()
             error = RangeNotSatisfiable(f"{request.headers['range'][:60]!r} is outside the {size} bytes of the result")
             return problem_response(request, error, 416, headers={"Content-Range": f"bytes */{size}"})
     _leave_ranges(request, parts)
-    return FileResponse(
-        path, filename=record.result.filename, media_type=record.result.media_type, headers=headers, background=after
+    return _OpenFileResponse(
+        file, filename=record.result.filename, media_type=record.result.media_type, headers=headers, background=after
     )
+
+
+class _OpenFileResponse(FileResponse):
+    """Send a file that is open already, whatever becomes of its name; close it at the end."""
+
+    def __init__(self, file: IO[bytes], **about: Any) -> None:
+        super().__init__(f"/dev/fd/{file.fileno()}", stat_result=os.fstat(file.fileno()), **about)
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        with self._file:
+            await super().__call__(scope, receive, send)
 
 
 def result_headers(record: JobRecord) -> dict[str, str]:
@@ -64,7 +92,7 @@ def result_headers(record: JobRecord) -> dict[str, str]:
     }
 
 
-def report_and_file(path: Path, record: JobRecord, *, after: BackgroundTask | None = None) -> StreamingResponse:
+def report_and_file(file: IO[bytes], record: JobRecord, *, after: BackgroundTask | None = None) -> StreamingResponse:
     """Send the report as JSON and then the file, as multipart/mixed (RFC 2046)."""
     assert record.result is not None
     result, boundary = record.result, f"straightpcf-{secrets.token_hex(12)}"
@@ -75,8 +103,8 @@ def report_and_file(path: Path, record: JobRecord, *, after: BackgroundTask | No
     tail = f"\r\n--{boundary}--\r\n".encode()
 
     async def body() -> AsyncIterator[bytes]:
-        yield head
-        with await asyncio.to_thread(path.open, "rb") as file:
+        with file:
+            yield head
             while chunk := await asyncio.to_thread(file.read, _CHUNK_BYTES):
                 yield chunk
         yield tail

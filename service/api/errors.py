@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -12,7 +14,14 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 
-from straightpcf.points.errors import InternalError, InvalidRequest, MethodNotAllowed, NotFound, StraightPCFError
+from straightpcf.points.errors import (
+    InternalError,
+    InvalidRequest,
+    MethodNotAllowed,
+    NotFound,
+    ServerBusy,
+    StraightPCFError,
+)
 from straightpcf.service.api.request_id import HEADER, request_id
 from straightpcf.service.api.schemas import Problem
 
@@ -21,6 +30,7 @@ __all__ = [
     "PROBLEM_MEDIA_TYPE",
     "RETRY_AFTER_SECONDS",
     "STATUS_BY_CODE",
+    "busy",
     "install_error_handlers",
     "problem_response",
 ]
@@ -93,6 +103,9 @@ GRPC_STATUS_BY_CODE: Mapping[str, str] = {
 
 _KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+_USED_UP = frozenset({errno.EMFILE, errno.ENFILE})
+
+logger = logging.getLogger("uvicorn.error")
 
 
 def install_error_handlers(app: FastAPI) -> None:
@@ -101,6 +114,7 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
     app.add_exception_handler(ClientDisconnect, _nobody_listens)
+    app.add_exception_handler(OSError, _system)
     app.add_exception_handler(Exception, _unforeseen)
 
 
@@ -136,6 +150,20 @@ async def _validation(request: Request, error: Exception) -> Response:
 
 async def _nobody_listens(request: Request, error: Exception) -> Response:
     return Response(status_code=400)
+
+
+async def _system(request: Request, error: Exception) -> Response:
+    if not isinstance(error, OSError) or (passing := busy(error)) is None:
+        raise error  # to _unforeseen, and into the log
+    return await _ours(request, passing)
+
+
+def busy(error: OSError) -> ServerBusy | None:
+    """Return what to say of an error that passes as soon as other requests let go of their files."""
+    if error.errno not in _USED_UP:
+        return None
+    logger.warning("a request is sent away: %s", error)
+    return ServerBusy("the server has no file descriptor left for this request")
 
 
 async def _unforeseen(request: Request, error: Exception) -> Response:

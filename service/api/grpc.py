@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import uuid
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import grpc
 from google.protobuf.empty_pb2 import Empty
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from straightpcf.points.errors import InvalidOptions, InvalidRequest, RangeNotSatisfiable
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, NotFound, RangeNotSatisfiable
 from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire import straightpcf_pb2 as pb
@@ -29,8 +30,10 @@ from straightpcf.points.wire.messages import (
     plain_of,
 )
 from straightpcf.points.wire.patches import PatchReader
+from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate
-from straightpcf.service.api.body import SpoolFile
+from straightpcf.service.api.body import SpoolFile, in_time
+from straightpcf.service.api.download import open_result
 from straightpcf.service.api.grpc_call import Caller, Context, answering
 from straightpcf.service.api.intake import file_name
 from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Info, Job, rfc3339
@@ -134,10 +137,13 @@ class DenoiseService(stubs.DenoiseServiceServicer):
         """Work on one file while its caller listens."""
         async with self._answering(context, "Denoise") as caller:
             config = (await _first(requests)).config
-            # Nobody else knows such a job: it lives as long as its call.
-            private = not config.job.id and caller.idempotency_key is None
-            record, _ = await self._take(config.job, requests, caller, endpoint="denoise")
+            # Nobody else knows such a job: it lives as long as its call. Its id is known before it is there, for a call
+            # may be cancelled while its job is being committed.
+            named = config.job.id or caller.idempotency_key is not None
+            private = None if named else uuid.uuid4().hex
             try:
+                id = private or config.job.id or None
+                record, _ = await self._take(config.job, requests, caller, endpoint="denoise", id=id)
                 await context.write(pb.DenoiseResponse(accepted=_job(record)))
                 if config.patches:
                     async for patch in self._patches(record):
@@ -145,14 +151,15 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 else:
                     async for progress in self._progress(record):
                         await context.write(pb.DenoiseResponse(progress=progress))
-                path, record = await self._engine.result(record.id, owner=record.owner)
-                if config.return_file:
-                    async for chunk in _chunks(path):
-                        await context.write(pb.DenoiseResponse(chunk=chunk))
+                file, record = await open_result(self._engine, record.id, owner=record.owner)
+                with file:
+                    if config.return_file:
+                        async for chunk in _chunks(file):
+                            await context.write(pb.DenoiseResponse(chunk=chunk))
                 await context.write(pb.DenoiseResponse(summary=_job(record)))
             finally:
-                if private:
-                    await asyncio.shield(self._engine.delete(record.id, owner=record.owner))
+                if private is not None:
+                    await asyncio.shield(self._forget(private, owner=caller.owner))
 
     async def CreateJob(  # noqa: N802
         self, requests: AsyncIterator[pb.CreateJobRequest], context: Context
@@ -160,7 +167,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
         """Commit a job."""
         async with self._answering(context, "CreateJob") as caller:
             config = (await _first(requests)).config
-            record, _ = await self._take(config, requests, caller, endpoint="jobs")
+            record, _ = await self._take(config, requests, caller, endpoint="jobs", id=config.id or None)
             return _job(record)
 
     async def GetJob(self, request: pb.GetJobRequest, context: Context) -> pb.Job:  # noqa: N802
@@ -216,13 +223,14 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     async def DownloadResult(self, request: pb.DownloadResultRequest, context: Context) -> None:  # noqa: N802
         """Send a result from an offset on."""
         async with self._answering(context, "DownloadResult") as caller:
-            path, record = await self._engine.result(request.id, owner=caller.owner)
-            result = Job.of(record).plain()["result"]
-            if request.offset > result["bytes"]:
-                raise RangeNotSatisfiable(f"offset {request.offset} is outside the {result['bytes']} bytes")
-            await context.write(pb.DownloadResultResponse(result=message_of(pb.ResultInfo, result)))
-            async for chunk in _chunks(path, request.offset):
-                await context.write(pb.DownloadResultResponse(chunk=chunk))
+            file, record = await open_result(self._engine, request.id, owner=caller.owner)
+            with file:
+                result = Job.of(record).plain()["result"]
+                if request.offset > result["bytes"]:
+                    raise RangeNotSatisfiable(f"offset {request.offset} is outside the {result['bytes']} bytes")
+                await context.write(pb.DownloadResultResponse(result=message_of(pb.ResultInfo, result)))
+                async for chunk in _chunks(file, request.offset):
+                    await context.write(pb.DownloadResultResponse(chunk=chunk))
 
     async def GetServerInfo(self, request: Empty, context: Context) -> pb.ServerInfo:  # noqa: N802
         """Say what this server is and takes."""
@@ -232,36 +240,31 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     # --- stages
 
     async def _take(
-        self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, *, endpoint: str
+        self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, *, endpoint: str, id: str | None
     ) -> tuple[JobRecord, bool]:
         """Spool the file and commit the job."""
         engine = self._engine
         options = DenoiseOptions(**plain_of(config.options))
         if config.format:
             format_named(config.format)
-        await engine.check_room()
-        received = 0
+        await engine.check_room(owner=caller.owner, id=id, idempotency_key=caller.idempotency_key)
         with engine.upload() as source:
-            with await asyncio.to_thread(source.open, "wb") as file:
-                spool = SpoolFile(file)
-                async for message in requests:
-                    if message.WhichOneof("part") != "chunk":
-                        raise InvalidRequest("a config comes once, before the first chunk")
-                    engine.limits.check_bytes(received := received + len(message.chunk))
-                    spool.buffer += message.chunk
-                    await spool.flush(above=WRITE_BYTES)
-                await spool.flush()
+            await in_time(engine, _receive(requests, source, limits=engine.limits))
             wanted = JobRequest(
                 options=options,
                 name=file_name(config.filename or None),
                 format=config.format or None,
                 owner=caller.owner,
-                id=config.id or None,
+                id=id,
                 idempotency_key=caller.idempotency_key,
                 endpoint=endpoint,
                 traceparent=caller.traceparent,
             )
             return await engine.submit(source, wanted)
+
+    async def _forget(self, id: str, *, owner: str) -> None:
+        with contextlib.suppress(NotFound):  # it was not committed, or someone else deleted it
+            await self._engine.delete(id, owner=owner)
 
     async def _progress(self, record: JobRecord) -> AsyncIterator[pb.Progress]:
         async for event in self._engine.events(record.id, owner=record.owner):
@@ -283,11 +286,24 @@ async def _first(requests: AsyncIterator[_Part]) -> _Part:
     return message
 
 
-async def _chunks(path: Path, offset: int = 0) -> AsyncIterator[bytes]:
-    with await asyncio.to_thread(path.open, "rb") as file:
-        file.seek(offset)
-        while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
-            yield chunk
+async def _receive(requests: AsyncIterator[Any], target: Path, *, limits: Limits) -> None:
+    """Write the chunks of a call to a file."""
+    received = 0
+    with await asyncio.to_thread(target.open, "wb") as file:
+        spool = SpoolFile(file)
+        async for message in requests:
+            if message.WhichOneof("part") != "chunk":
+                raise InvalidRequest("a config comes once, before the first chunk")
+            limits.check_bytes(received := received + len(message.chunk))
+            spool.buffer += message.chunk
+            await spool.flush(above=WRITE_BYTES)
+        await spool.flush()
+
+
+async def _chunks(file: IO[bytes], offset: int = 0) -> AsyncIterator[bytes]:
+    file.seek(offset)
+    while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+        yield chunk
 
 
 def _job(record: JobRecord) -> pb.Job:

@@ -16,7 +16,7 @@ from grpc_status import rpc_status
 
 from straightpcf.points.errors import InternalError, StraightPCFError
 from straightpcf.service.api.auth import Gate
-from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS
+from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS, busy
 from straightpcf.service.api.intake import checked_key
 from straightpcf.service.api.request_id import usable_id
 from straightpcf.service.telemetry import Telemetry
@@ -57,10 +57,13 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
     except StraightPCFError as error:
         status = GRPC_STATUS_BY_CODE[error.code]
         await _abort(context, error, id)
-    except Exception:
-        status = "INTERNAL"
-        logger.exception("request %s: %s failed", id, method)
-        await _abort(context, InternalError("the server met an error of its own"), id)
+    except Exception as fault:
+        passing = busy(fault) if isinstance(fault, OSError) else None
+        if passing is None:
+            logger.exception("request %s: %s failed", id, method)
+        told = passing or InternalError("the server met an error of its own")
+        status = GRPC_STATUS_BY_CODE[told.code]
+        await _abort(context, told, id)
     except BaseException:
         status = "CANCELLED"
         raise

@@ -28,8 +28,8 @@ async def take_job(
 ) -> tuple[JobRecord, bool, Mapping[str, str]]:
     """Receive the body and commit the job; return it, whether it is new, and every field that came with it."""
     engine: Engine = request.app.state.engine
-    await engine.check_room(size=declared_size(request))
     key = checked_key(request.headers.get("idempotency-key"))
+    await engine.check_room(size=declared_size(request), owner=owner, id=id, idempotency_key=key)
     query = request.query_params
     _check_once([name for name, _ in query.multi_items()])  # before the body, so that it need not be read
     _parse_fields(query, more_fields)

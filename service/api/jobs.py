@@ -11,14 +11,16 @@ from fastapi.responses import JSONResponse, Response
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.service.api.auth import owner_of
-from straightpcf.service.api.download import result_response
+from straightpcf.service.api.download import open_result, result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
 from straightpcf.service.api.intake import take_job
 from straightpcf.service.api.openapi import (
+    EVENTS_PARAMETERS,
     EVENTS_RESPONSES,
     JOB_BODY,
+    JOB_PARAMETERS,
     JOB_RESPONSES,
-    QUERY_PARAMETERS,
+    RESULT_PARAMETERS,
     RESULT_RESPONSES,
     STREAM_RESPONSES,
     problems,
@@ -41,7 +43,7 @@ def job_response(record: JobRecord, status: int, headers: dict[str, str] | None 
 
 @router.post(
     "/jobs", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job",
-    openapi_extra={"requestBody": JOB_BODY, "parameters": QUERY_PARAMETERS},
+    openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
 )  # fmt: skip
 async def create_job(request: Request, owner: Owner) -> Response:
     """Take a cloud and answer at once; the job is on the disk by then."""
@@ -51,7 +53,7 @@ async def create_job(request: Request, owner: Owner) -> Response:
 
 @router.put(
     "/jobs/{id}", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job with a chosen id",
-    openapi_extra={"requestBody": JOB_BODY, "parameters": QUERY_PARAMETERS},
+    openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
 )  # fmt: skip
 async def put_job(id: str, request: Request, owner: Owner) -> Response:
     """Make a job once, however often the same request comes."""
@@ -87,7 +89,10 @@ async def get_job(
     return Job.of(await engine.wait(id, owner=owner, seconds=wait))
 
 
-@router.get("/jobs/{id}/events", response_class=Response, responses=EVENTS_RESPONSES, summary="Follow a job")
+@router.get(
+    "/jobs/{id}/events", response_class=Response, responses=EVENTS_RESPONSES, summary="Follow a job",
+    openapi_extra={"parameters": EVENTS_PARAMETERS},
+)  # fmt: skip
 async def job_events(
     id: str,
     request: Request,
@@ -127,11 +132,13 @@ async def delete_job(id: str, request: Request, owner: Owner) -> None:
 async def _result(id: str, request: Request, owner: Owner) -> Response:
     """Send the result; `Range`, `If-Range` and `If-None-Match` are understood."""
     engine: Engine = request.app.state.engine
-    path, record = await engine.result(id, owner=owner)
-    return result_response(request, path, record)
+    file, record = await open_result(engine, id, owner=owner)
+    return result_response(request, file, record)
 
 
-_RESULT: dict[str, Any] = {"response_class": Response, "responses": RESULT_RESPONSES}
+_RESULT: dict[str, Any] = {
+    "response_class": Response, "responses": RESULT_RESPONSES, "openapi_extra": {"parameters": RESULT_PARAMETERS},
+}  # fmt: skip
 router.get("/jobs/{id}/result", summary="Fetch the result", operation_id="get_result", **_RESULT)(_result)
 router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="head_result", **_RESULT)(_result)
 
@@ -139,7 +146,7 @@ router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="h
 @router.head("/jobs/{id}/report", include_in_schema=False)
 @router.get(
     "/jobs/{id}/report", response_model=Report, summary="The report",
-    responses=problems(401, 404, 409, 410, 413, 415, 500),
+    responses=problems(401, 404, 409, 410, 413, 415, 500, 507),
 )  # fmt: skip
 async def job_report(id: str, request: Request, owner: Owner) -> Report:
     """Show displacement, noise before and after, passes, timings and warnings."""

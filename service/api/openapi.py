@@ -15,17 +15,20 @@ __all__ = [
     "DENOISE_FORM_BODY",
     "DENOISE_PARAMETERS",
     "DENOISE_RESPONSES",
+    "EVENTS_PARAMETERS",
     "EVENTS_RESPONSES",
     "JOB_BODY",
+    "JOB_PARAMETERS",
     "JOB_RESPONSES",
     "PATH_PARAMETER",
-    "QUERY_PARAMETERS",
+    "RESULT_PARAMETERS",
     "RESULT_RESPONSES",
     "STREAM_RESPONSES",
     "document_problems",
     "problems",
 ]
 
+_SHA256 = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 _FORMAT_NAMES = [format.name for format in FORMATS]
 
 _OPTIONS: dict[str, dict[str, Any]] = {
@@ -69,7 +72,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
-QUERY_PARAMETERS: list[dict[str, Any]] = [
+_QUERY: list[dict[str, Any]] = [
     {
         "name": name,
         "in": "query",
@@ -86,9 +89,38 @@ _REPORT: dict[str, Any] = {
     "default": False,
 }
 
+
+def _header(name: str, description: str, example: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "in": "header",
+        "required": False,
+        "description": description,
+        "schema": {"type": "string"},
+        "example": example,
+    }
+
+
+_IDEMPOTENCY_KEY = _header(
+    "Idempotency-Key", "The same key with the same request stands for the same job.", "b9f7a0c2-scan-17"
+)
+_PREFER = _header("Prefer", "`respond-async`, `wait=N` (seconds) or both (RFC 7240).", "wait=30")
+
+JOB_PARAMETERS: list[dict[str, Any]] = [*_QUERY, _IDEMPOTENCY_KEY]
+
 DENOISE_PARAMETERS: list[dict[str, Any]] = [
-    *QUERY_PARAMETERS,
+    *_QUERY,
     {"name": "report", "in": "query", "required": False, "schema": _REPORT},
+    _IDEMPOTENCY_KEY,
+    _PREFER,
+]
+
+EVENTS_PARAMETERS = [_header("Last-Event-ID", "Go on behind this event.", "17")]
+
+RESULT_PARAMETERS = [
+    _header("Range", "Send these bytes alone; what is malformed is ignored.", "bytes=0-65535"),
+    _header("If-Range", "Heed Range only while this is the result's ETag.", f'"{_SHA256}"'),
+    _header("If-None-Match", "Answer 304 where one of these is the result's ETag.", f'"{_SHA256}"'),
 ]
 
 PATH_PARAMETER: dict[str, Any] = {
@@ -130,7 +162,6 @@ def _form_body(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
 JOB_BODY = _form_body(_OPTIONS)
 DENOISE_FORM_BODY = _form_body({**_OPTIONS, "report": _REPORT})
 
-_SHA256 = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 _RESULT_HEADERS = {
     "X-Request-Id": ("The id of this request, also in every problem.", "string", "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"),
     "X-Job-Id": ("The job that made it.", "string", "c53b6bb26ca24d55af66ff11d0fa5dea"),
@@ -209,7 +240,7 @@ DENOISE_RESPONSES: dict[int | str, dict[str, Any]] = {
         "content": _JOB,
         "headers": _LOCATION,
     },
-    **problems(*_INTAKE, 410),
+    **problems(*_INTAKE, 404, 410),
 }
 
 JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -222,7 +253,7 @@ RESULT_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"description": "The cloud.", **_FILE},
     206: {"description": "The part that was asked for.", **_FILE},
     304: {"description": "What If-None-Match names is still the result."},
-    **problems(400, 401, 404, 409, 410, 413, 415, 416, 500),
+    **problems(400, 401, 404, 409, 410, 413, 415, 416, 500, 503, 507),
 }
 
 EVENTS_RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -242,5 +273,5 @@ STREAM_RESPONSES: dict[int | str, dict[str, Any]] = {
             "application/x-ndjson": {"schema": {"type": "string"}},
         },
     },
-    **problems(400, 401, 404, 409, 410, 413, 415, 500),
+    **problems(400, 401, 404, 409, 410, 413, 415, 500, 507),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
@@ -10,9 +11,9 @@ from fastapi.responses import JSONResponse, Response
 from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect
 
-from straightpcf.points.errors import ServerBusy
+from straightpcf.points.errors import NotFound, ServerBusy
 from straightpcf.service.api.auth import owner_of
-from straightpcf.service.api.download import report_and_file, result_response
+from straightpcf.service.api.download import open_result, report_and_file, result_response
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
 from straightpcf.service.api.intake import flag, take_job
 from straightpcf.service.api.jobs import job_response
@@ -78,25 +79,25 @@ async def denoise(request: Request, owner: Owner) -> Response:
         record = await _wait_while_connected(engine, request, record, seconds)
     except ClientDisconnect:
         if private:
-            await engine.delete(record.id, owner=owner)
+            await _forget(engine, record)
         raise
     except ServerBusy:  # it shuts down: the job is done at its next start
         record = await engine.get(record.id, owner=owner)
     applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
         return job_response(record, 202, applied)
-    cleanup = BackgroundTask(engine.delete, record.id, owner=owner) if private else None
+    cleanup = BackgroundTask(_forget, engine, record) if private else None
     try:
-        path, record = await engine.result(record.id, owner=owner)
+        file, record = await open_result(engine, record.id, owner=owner)
         if flag(fields, "report"):
-            answer: Response = report_and_file(path, record, after=cleanup)
+            answer: Response = report_and_file(file, record, after=cleanup)
         else:
-            answer = result_response(request, path, record, after=cleanup)
+            answer = result_response(request, file, record, after=cleanup)
         answer.headers.update(applied)
         return answer
     except Exception:
         if private:
-            await engine.delete(record.id, owner=owner)
+            await _forget(engine, record)
         raise
 
 
@@ -139,6 +140,11 @@ async def _wait_while_connected(engine: Engine, request: Request, record: JobRec
     finally:
         gone.cancel()
         result.cancel()
+
+
+async def _forget(engine: Engine, record: JobRecord) -> None:
+    with contextlib.suppress(NotFound):  # someone found it in the list, and was quicker
+        await engine.delete(record.id, owner=record.owner)
 
 
 async def _disconnected(request: Request) -> None:

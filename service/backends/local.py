@@ -89,24 +89,32 @@ class LocalBackend:
         """Keep one worker alive, waiting longer after each one that died before it was ready."""
         delay = FIRST_RESTART_DELAY_SECONDS
         while self._failure is None:
-            worker = WorkerProcess(spec)
             try:
-                self._warm[worker] = await asyncio.shield(worker.ready)
-                self._idle.put_nowait(worker)
-                logger.info("worker %s is ready on %s", worker.pid, self._warm[worker])
+                await self._offer(spec)
                 delay = FIRST_RESTART_DELAY_SECONDS
-                await asyncio.shield(worker.died)
-                self.restarts += 1
-                logger.warning("worker %s died; starting another", worker.pid)
             except WorkerDied as death:
                 logger.warning("%s; starting another in %g s", death, delay)
                 await asyncio.sleep(delay)
                 delay = min(2 * delay, MAX_RESTART_DELAY_SECONDS)
             except StraightPCFError as error:
                 self._fail(error)
-            finally:
-                self._warm.pop(worker, None)
-                await worker.stop(patience_seconds=STOP_PATIENCE_SECONDS)
+
+    async def _offer(self, spec: WorkerSpec) -> None:
+        """Start a worker, offer it to jobs and return when it has died; raises WorkerDied if it never was ready."""
+        try:
+            worker = WorkerProcess(spec)
+        except OSError as exc:  # no file descriptor, process or memory is left: others may let go of some
+            raise WorkerDied(f"a worker could not be started ({exc})") from exc
+        try:
+            self._warm[worker] = await asyncio.shield(worker.ready)
+            self._idle.put_nowait(worker)
+            logger.info("worker %s is ready on %s", worker.pid, self._warm[worker])
+            await asyncio.shield(worker.died)
+            self.restarts += 1
+            logger.warning("worker %s died; starting another", worker.pid)
+        finally:
+            self._warm.pop(worker, None)
+            await worker.stop(patience_seconds=STOP_PATIENCE_SECONDS)
 
     def _fail(self, error: StraightPCFError) -> None:
         logger.error("no worker can start: %s", error)

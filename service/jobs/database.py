@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from straightpcf.points.errors import InvalidOptions
+from straightpcf.service.jobs.full_disk import is_full, release_reserve
 
 __all__ = ["open_database"]
 
@@ -15,8 +16,29 @@ _BUSY_SECONDS = 30.0
 
 
 def open_database(path: Path) -> sqlite3.Connection:
-    """Open or create the file; raises InvalidOptions if a newer straightpcf wrote it, sqlite3.Error if it is none."""
+    """Open or create the file; raises InvalidOptions if a newer straightpcf wrote it, sqlite3.Error if it is none.
+
+    On a full disk it takes the reserve beside it.
+    """
+    try:
+        return _open(path)
+    except sqlite3.Error as exc:
+        if not (is_full(exc) and release_reserve(path.parent)):
+            raise
+        return _open(path)
+
+
+def _open(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False)
+    try:
+        _prepare(db, path)
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
+def _prepare(db: sqlite3.Connection, path: Path) -> None:
     db.row_factory = sqlite3.Row
     db.execute("PRAGMA journal_mode = WAL")
     db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
@@ -24,6 +46,9 @@ def open_database(path: Path) -> sqlite3.Connection:
     (version,) = db.execute("PRAGMA user_version").fetchone()
     if version > SCHEMA_VERSION:
         raise InvalidOptions(f"{path} is of schema {version}; this straightpcf is older and knows {SCHEMA_VERSION}")
+    (fault,) = db.execute("PRAGMA quick_check(1)").fetchone()
+    if fault != "ok":
+        raise sqlite3.DatabaseError(f"{path.name} is damaged: {' '.join(fault.split())}")
     db.executescript(files(__package__).joinpath("schema.sql").read_text())
     columns = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
     if "deaths" not in columns:  # before versions were counted
@@ -31,5 +56,5 @@ def open_database(path: Path) -> sqlite3.Connection:
     if "spool" not in columns:  # likewise
         db.execute("ALTER TABLE jobs ADD COLUMN spool INTEGER NOT NULL DEFAULT 0")
         db.execute("UPDATE jobs SET spool = bytes + IFNULL(json_extract(result, '$.bytes'), 0)")
-    db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-    return db
+    if version != SCHEMA_VERSION:  # a full disk has no room for what is there already
+        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")

@@ -19,7 +19,7 @@ from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 __all__ = ["INPUT", "JobFolders", "digest_of"]
 
 INPUT = "input"
-_ORPHAN_SECONDS = 3600.0  # an upload or folder that no job owns is given up after this
+_ORPHAN_SECONDS = 3600.0  # an upload, folder or lock that nobody owns is given up after this
 
 
 class JobFolders:
@@ -83,9 +83,9 @@ class JobFolders:
         return shutil.disk_usage(self._jobs).free
 
     def dead_servers(self, servers: Collection[str]) -> list[str]:
-        """Return those servers whose lock nobody holds any more, and remove their locks."""
+        """Return those servers whose lock nobody holds any more; remove their locks, and old ones of any other."""
         dead = []
-        for server in servers:
+        for server in {*servers, *self._old_locks()}:
             path = self._lock_path(server)
             try:
                 with path.open("rb") as lock:
@@ -95,22 +95,20 @@ class JobFolders:
             except OSError:
                 continue  # it lives
             path.unlink(missing_ok=True)
-            dead.append(server)
+            if server in servers:
+                dead.append(server)
         return dead
 
     def orphans(self) -> list[str]:
         """Name job folders that are old enough to have been committed, and drop uploads that nobody finished."""
-        old = time.time() - _ORPHAN_SECONDS
-        for upload in self._incoming.iterdir():
-            with suppress(FileNotFoundError):
-                if upload.stat().st_mtime < old:
-                    upload.unlink()
-        names = []
-        for folder in self._jobs.iterdir():
-            with suppress(FileNotFoundError):
-                if folder.stat().st_mtime < old:
-                    names.append(folder.name)
-        return names
+        for upload in _old_in(self._incoming):
+            if upload.is_file():  # a folder is none of ours
+                upload.unlink(missing_ok=True)
+        return [folder.name for folder in _old_in(self._jobs)]
+
+    def _old_locks(self) -> list[str]:
+        """Name the servers that began so long ago that they hold their locks if they live."""
+        return [path.stem for path in _old_in(self._servers) if path.suffix == ".lock"]
 
     def _lock_path(self, server: str) -> Path:
         return self._servers / f"{server}.lock"
@@ -120,6 +118,16 @@ def digest_of(path: Path) -> str:
     """Return a file's sha256 in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _old_in(folder: Path) -> list[Path]:
+    before = time.time() - _ORPHAN_SECONDS
+    old = []
+    for path in folder.iterdir():
+        with suppress(FileNotFoundError):
+            if path.stat().st_mtime < before:
+                old.append(path)
+    return old
 
 
 def _bytes_in(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""What a job is, and what happened to it."""
+"""What a job is to be, what it is, and what happened to it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,40 @@ from straightpcf.points.errors import StraightPCFError
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.jobs import FINISHED, STATES, JobState, ResultInfo
 
-__all__ = ["FINISHED", "STATES", "Claim", "EventKind", "JobEvent", "JobRecord", "JobState", "ResultInfo"]
+__all__ = [
+    "FINISHED",
+    "STATES",
+    "Claim",
+    "EventKind",
+    "JobEvent",
+    "JobRecord",
+    "JobState",
+    "Load",
+    "NewJob",
+    "ResultInfo",
+]
 
 EventKind = Literal["queued", "start", "progress", "preview", "output", "log", "completed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewJob:
+    """Describe a job to be; weight: its points, estimated; spool: bytes that its files may come to; digest: of the
+    whole request.
+    """
+
+    id: str
+    owner: str
+    folder: str
+    name: str | None
+    format: str | None
+    options: DenoiseOptions
+    bytes: int
+    weight: int
+    spool: int
+    digest: str
+    idempotency_key: str | None = None
+    traceparent: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +81,11 @@ class JobRecord:
         """Tell whether nothing more happens to it."""
         return self.state in FINISHED
 
+    @property
+    def may_run_again(self) -> bool:
+        """Tell whether it failed of what may be over by now: the same request makes it anew, under the same id."""
+        return self.error is not None and self.error.retryable
+
 
 @dataclass(frozen=True, kw_only=True)
 class JobEvent:
@@ -65,9 +101,24 @@ class JobEvent:
 class Claim:
     """Hold the right to work on a job: `fence` grows with every claim, and an older one can write nothing.
 
+    That holds for an id, too: a job that has the id of one that was deleted has greater fences.
+
     deaths: of workers that had the job before.
     """
 
     record: JobRecord
     fence: int
     deaths: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """Sum up jobs: those that wait or run, their estimated points, and bytes of files.
+
+    bytes: of all that are kept, with what the unfinished ones may come to. coming: of the latter, beside their inputs.
+    """
+
+    jobs: int
+    points: int
+    bytes: int
+    coming: int

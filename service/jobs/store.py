@@ -11,7 +11,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -35,48 +35,18 @@ from straightpcf.service.jobs.record import (
     JobEvent,
     JobRecord,
     JobState,
+    Load,
+    NewJob,
     ResultInfo,
 )
 
-__all__ = ["JobStore", "Load", "NewJob"]
+__all__ = ["JobStore"]
 
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
 Hold = Literal["held", "canceled", "lost"]
+_FENCES = 2**32  # of one row: those of rows are apart, so that no fence comes back with an id that is used again
 _PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
-
-
-@dataclass(frozen=True, kw_only=True)
-class NewJob:
-    """Describe a job to be; weight: its points, estimated; spool: bytes that its files may come to; digest: of the
-    whole request.
-    """
-
-    id: str
-    owner: str
-    folder: str
-    name: str | None
-    format: str | None
-    options: DenoiseOptions
-    bytes: int
-    weight: int
-    spool: int
-    digest: str
-    idempotency_key: str | None = None
-    traceparent: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Load:
-    """Sum up jobs: those that wait or run, their estimated points, and bytes of files.
-
-    bytes: of all that are kept, with what the unfinished ones may come to. coming: of the latter, beside their inputs.
-    """
-
-    jobs: int
-    points: int
-    bytes: int
-    coming: int
 
 
 class JobStore:
@@ -97,11 +67,16 @@ class JobStore:
     def create(self, job: NewJob) -> tuple[JobRecord, bool]:
         """Commit a queued job and return it with True, or the one that the same request made before with False.
 
-        Raises IdempotencyConflict, IdConflict where another request has the key or the id.
+        That one is made anew if it may run again. Raises IdempotencyConflict, IdConflict where another request has
+        the key or the id.
         """
         with self._transaction():
             if (known := self._known(job)) is not None:
-                return self._record(known), False
+                record = self._record(known)
+                if not record.may_run_again:
+                    return record, False
+                self._db.execute("DELETE FROM jobs WHERE seq = ?", (known["seq"],))
+                job = replace(job, id=record.id)
             now = time.time()
             self._db.execute(
                 "INSERT INTO jobs (id, owner, folder, state, name, format, options, bytes, weight, spool, created_at,"
@@ -114,9 +89,14 @@ class JobStore:
             return record, True
 
     def match(self, job: NewJob) -> JobRecord | None:
-        """Return what `create` would return with False; raises like it."""
+        """Return what the same request made before; raises like `create`."""
         row = self._known(job)
         return None if row is None else self._record(row)
+
+    def has(self, owner: str, *, id: str | None, idempotency_key: str | None) -> bool:
+        """Tell whether a job of this owner has the id or the key."""
+        query = "SELECT 1 FROM jobs WHERE owner = ? AND (id = ? OR idempotency_key = ?)"
+        return self._db.execute(query, (owner, id, idempotency_key)).fetchone() is not None
 
     def get(self, id: str, owner: str | None = None) -> JobRecord:
         """Return a job; raises NotFound, also for a job of another owner."""
@@ -185,9 +165,9 @@ class JobStore:
         with self._transaction():
             now = time.time()
             row = self._db.execute(
-                "UPDATE jobs SET state = 'starting', fence = fence + 1, attempts = attempts + 1, server = ?,"
-                " lease_until = ?, started_at = IFNULL(started_at, ?), progress = 0 WHERE seq ="
-                " (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
+                f"UPDATE jobs SET state = 'starting', fence = MAX(fence + 1, seq * {_FENCES}), server = ?,"
+                " attempts = attempts + 1, lease_until = ?, started_at = IFNULL(started_at, ?), progress = 0"
+                " WHERE seq = (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
                 (server, now + lease_seconds, now),
             ).fetchone()
             return None if row is None else Claim(record=self._record(row), fence=row["fence"], deaths=row["deaths"])
@@ -269,6 +249,11 @@ class JobStore:
             for row in rows:
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
+
+    def over(self) -> list[str]:
+        """Name the folders of what is over its time, and not marked so; writes nothing."""
+        query = f"SELECT folder FROM jobs WHERE state IN {_finished()} AND expires_at < ?"
+        return [row["folder"] for row in self._db.execute(query, (time.time(),))]
 
     def expire(self, *, rows_after: float) -> list[str]:
         """Mark what is over its time, forget what has been so for rows_after seconds; return folders to remove."""

@@ -198,7 +198,7 @@ def test_finished_jobs_expire_and_are_then_forgotten(tmp_path: Path) -> None:
         backend.finish.set()
         record, _ = await submit(engine)
         await engine.wait(record.id)
-        await engine._sweep()
+        await engine._sweeper.sweep()
         assert (await engine.get(record.id)).state == "expired"
         assert not list((tmp_path / "jobs").iterdir())
 

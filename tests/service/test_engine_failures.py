@@ -20,6 +20,7 @@ from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import WorkerDied
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import runner
+from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import Claim
 from straightpcf.service.jobs.store import JobStore
 from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, submit, until
@@ -75,7 +76,7 @@ def test_a_job_whose_end_cannot_be_written_runs_again_while_the_server_is_busy(
         second, _ = await submit(engine, b"1 1 1\n")
         await until(lambda: len(backend.runs) == 2)
         while (await engine.get(first.id)).state != "queued":
-            await engine._sweep()
+            await engine._sweeper.sweep()
             await asyncio.sleep(0.02)
         assert (await engine.get(second.id)).attempts == 1  # its lease was renewed all the while
         backend.finish.set()
@@ -162,7 +163,7 @@ def test_a_canceled_job_is_not_started_again_when_its_worker_or_server_dies(tmp_
         for _ in records:
             await engine._call(JobStore.claim, "the dead", 15.0)
         await engine._call(JobStore.request_cancel, records[0].id, expires_in=60)
-        await engine._sweep()
+        await engine._sweeper.sweep()
         assert [(await engine.get(record.id)).state for record in records] == ["canceled", "queued"]
 
     play(tmp_path / "worker", worker, WorkerDied("killed"))
@@ -213,6 +214,44 @@ def test_patches_are_reserved_for_and_then_counted_as_they_are(tmp_path: Path) -
         await submit(engine, points, name="a.xyz", options=once)
 
     play(tmp_path, scenario, max_spool_bytes=700)
+
+
+def test_an_upload_is_counted_once_by_what_must_stay_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = [10**6]
+    monkeypatch.setattr(JobFolders, "free_bytes", lambda folders: free[0])
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        await submit(engine, body := b"x" * 60)
+        coming = (await engine._call(JobStore.load)).coming  # beside the input, which is on the disk by then
+        free[0] = 1000 + 2 * coming - 1
+        with pytest.raises(SpoolFull):
+            await submit(engine, body)
+        free[0] += 1
+        await submit(engine, body)
+
+    play(tmp_path, scenario, min_free_bytes=1000)
+
+
+def test_what_is_over_its_time_makes_the_room_that_marking_it_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expire = JobStore.expire
+
+    def expire_if_there_is_room(store: JobStore, *, rows_after: float) -> list[str]:
+        if list((tmp_path / "jobs").iterdir()):
+            raise SpoolFull("the server's disk is full")
+        return expire(store, rows_after=rows_after)
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        record, _ = await submit(engine)
+        await engine.wait(record.id)
+        monkeypatch.setattr(JobStore, "expire", expire_if_there_is_room)
+        await engine._sweeper.sweep()
+        assert (await engine.get(record.id)).state == "expired"
+
+    play(tmp_path, scenario, result_ttl_seconds=1e-6)
 
 
 def test_a_store_from_before_patches_were_counted_is_taken_over(tmp_path: Path) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from straightpcf.model.filter import load_filter
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob
 from straightpcf.service.backends.worker import Failed, _answer
+from straightpcf.service.jobs.full_disk import RESERVE, RESERVE_BYTES
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer, run_server
 from tests.waiting import wait_for
@@ -43,13 +45,17 @@ def disk(server: RunningServer) -> Path:
     return Path(f"/proc/{server.process.pid}/root{server.data_dir}")
 
 
-def filled(disk: Path) -> Path:
-    """Leave no byte."""
+@contextmanager
+def filled(disk: Path) -> Iterator[None]:
+    """Leave no byte for a while."""
     filler = disk / "filler"
     with suppress(OSError), filler.open("wb", buffering=0) as file:
         while True:
             file.write(bytes(4096))
-    return filler
+    try:
+        yield
+    finally:
+        filler.unlink()
 
 
 def test_an_upload_that_fills_the_disk_is_told_so_and_leaves_nothing(server: RunningServer, disk: Path) -> None:
@@ -78,14 +84,60 @@ def test_what_cannot_be_written_down_is_told_so_and_can_be_asked_again(server: R
     os.kill(server.worker_pid(), signal.SIGSTOP)  # so that all but one of these wait
     with httpx2.Client(base_url=server.url, timeout=20) as http:
         ids = [http.put(f"/jobs/wait-{n}", content=b"0 0 0\n").json()["id"] for n in range(20)]
-        filler = filled(disk)
-        answers = [http.post(f"/jobs/{id}/cancel") for id in ids]
+        (disk / RESERVE).unlink(missing_ok=True)
+        with filled(disk):
+            answers = [http.post(f"/jobs/{id}/cancel") for id in ids]
         assert {answer.status_code for answer in answers} <= {200, 202, 507}
         refused = [answer.json()["code"] for answer in answers if answer.status_code == 507]
         assert set(refused) == {"spool_full"}
-        filler.unlink()
         assert {http.post(f"/jobs/{id}/cancel").status_code for id in ids} <= {200, 202}
         wait_for(lambda: all(http.get(f"/jobs/{id}").json()["finished_at"] for id in ids))
+
+
+def test_a_job_is_deleted_on_a_full_disk_by_what_is_kept_for_that(server: RunningServer, disk: Path) -> None:
+    server.wait_until_ready()
+    server.delete_jobs()
+    os.kill(server.worker_pid(), signal.SIGSTOP)
+    with httpx2.Client(base_url=server.url, timeout=20) as http:
+        for name in ("one", "two"):
+            assert http.put(f"/jobs/{name}", content=b"0 0 0\n").status_code == 202
+        with filled(disk):
+            assert http.put("/jobs/three", content=b"0 0 0\n").status_code == 507
+            assert http.delete("/jobs/two").status_code == 204
+    server.delete_jobs()
+
+
+def test_a_server_starts_on_a_full_disk_and_makes_room_by_what_is_over_its_time(tmp_path: Path) -> None:
+    (data := tmp_path / "data").mkdir()
+    holder = subprocess.Popen([*ON_A_SMALL_DISK, str(data), "sleep", "600"])  # of the disk, between two servers
+    try:
+        within = ("nsenter", "--target", str(holder.pid), "--user", "--mount", "--preserve-credentials")
+        disk = Path(f"/proc/{holder.pid}/root{data}")
+        if not _is_mounted(holder, disk):
+            pytest.skip("this machine lets us mount nothing")
+        settings = {"STRAIGHTPCF_MIN_FREE_BYTES": "0", "STRAIGHTPCF_RESULT_TTL_SECONDS": "1"}
+        with run_server(tmp_path, environment=settings, within=within) as server:
+            httpx2.put(f"{server.url}/jobs/old?iterations=1", content=bytes(2**16))  # no cloud: it fails
+            assert httpx2.get(f"{server.url}/jobs/old?wait=60", timeout=90).json()["state"] == "failed"
+        time.sleep(1)
+        assert list((disk / "jobs").iterdir())
+        with filled(disk), run_server(tmp_path, environment=settings, within=within) as server:
+            assert httpx2.get(f"{server.url}/jobs/old").json()["state"] == "expired"
+            assert not list((disk / "jobs").iterdir())
+            assert (disk / RESERVE).stat().st_size == RESERVE_BYTES
+            assert "Traceback" not in server.log.read_text()
+    finally:
+        holder.kill()
+        holder.wait()
+
+
+def _is_mounted(holder: subprocess.Popen[bytes], disk: Path) -> bool:
+    while holder.poll() is None:
+        with suppress(OSError):
+            if disk.stat().st_dev != disk.parent.stat().st_dev:
+                return True
+        time.sleep(0.02)
+    return False
 
 
 def test_a_worker_whose_files_find_no_room_says_so(tmp_path: Path) -> None:

@@ -63,6 +63,9 @@ def test_a_packed_body_is_refused_and_not_taken_for_points(server: RunningServer
     answer = httpx2.put(url, content=bytes(1600), headers={"Content-Encoding": "gzip"})
     assert (answer.status_code, answer.json()["code"]) == (415, "unknown_format")
     assert "gzip" in answer.json()["detail"]
+    for codings in (["identity", "gzip"], ["identity, br"], ["", "zstd"]):
+        headers = [("Content-Encoding", coding) for coding in codings]
+        assert httpx2.put(url, content=bytes(1600), headers=headers).status_code == 415, codings
     assert httpx2.put(url, content=npy(), headers={"Content-Encoding": "identity"}, timeout=60).status_code == 200
 
 

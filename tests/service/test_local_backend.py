@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from pathlib import Path
 
 import pytest
@@ -20,13 +21,15 @@ JOB = FileJob(id="1", source=Path("in"), target=Path("out"), options=DenoiseOpti
 
 
 class Workers:
-    """Stand in for WorkerProcess; the first `deaths` jobs kill their worker."""
+    """Stand in for WorkerProcess; the first `deaths` jobs kill their worker. faults: what the next starts meet."""
 
-    def __init__(self, *, deaths: int = 0, failure: StraightPCFError | None = None) -> None:
-        self.deaths, self.failure = deaths, failure
+    def __init__(self, *faults: OSError, deaths: int = 0, failure: StraightPCFError | None = None) -> None:
+        self.faults, self.deaths, self.failure = list(faults), deaths, failure
         self.started = 0
 
     def __call__(self, spec: WorkerSpec) -> Worker:
+        if self.started and self.faults:
+            raise self.faults.pop(0)
         self.started += 1
         return Worker(self)
 
@@ -98,3 +101,24 @@ def test_a_worker_that_can_never_start_fails_every_job_and_is_told_once(monkeypa
     with pytest.raises(DeviceUnavailable):
         run(backend, jobs=3)
     assert (told, workers.started) == (["told"], 1)
+
+
+def test_a_worker_that_cannot_be_replaced_at_this_moment_is_replaced_later(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults = [OSError(errno.EMFILE, "Too many open files"), BlockingIOError(errno.EAGAIN, "no process")]
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(*faults, deaths=1))
+    monkeypatch.setattr(local, "FIRST_RESTART_DELAY_SECONDS", 0.01)
+
+    async def scenario() -> None:
+        backend = LocalBackend([SPEC])
+        await backend.start()
+        with pytest.raises(WorkerDied):
+            await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5)
+        assert await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5) == REPORT
+        assert (workers.started, workers.faults, backend.restarts) == (2, [], 1)
+        await backend.stop()
+
+    asyncio.run(scenario())
+    assert "Too many open files" in caplog.text
+    assert "no process" in caplog.text

@@ -139,8 +139,11 @@ def test_an_odd_cloud_is_denoised_to_finite_points(server: RunningServer, xyz: A
     assert np.isfinite(load(answer)).all()
 
 
-def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningServer) -> None:
-    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=npy(sphere(200) * 1e300))
+@pytest.mark.parametrize(
+    "xyz", [sphere(200) * 1e300, np.sign(sphere(200)) * 1.7e308], ids=["sphere", "corners of a cube"]
+)
+def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningServer, xyz: Any) -> None:
+    answer = curl("--data-binary", "@-", f"{server.url}/denoise?iterations=1", stdin=npy(xyz))
     if answer.status == 200:
         assert np.isfinite(load(answer)).all()
     else:
@@ -206,7 +209,7 @@ def test_a_wrong_method_is_told_every_right_one(server: RunningServer, path: str
 
 def test_head_answers_as_get_does_without_the_body(server: RunningServer) -> None:
     with httpx2.Client(base_url=server.url) as client:
-        for path in ("/livez", "/healthz", "/readyz", "/jobs", "/v1/info", "/", "/jobs/nope"):
+        for path in ("/livez", "/healthz", "/readyz", "/jobs", "/v1/info", "/", "/jobs/nope", "/docs", "/openapi.json"):
             get, head = client.get(path), client.head(path)
             assert (head.status_code, head.content) == (get.status_code, b""), path
             assert head.headers["content-type"] == get.headers["content-type"]
@@ -260,6 +263,28 @@ def test_the_openapi_document_has_examples_and_problems(server: RunningServer) -
             names = [(each["name"], each["in"]) for each in operation.get("parameters", [])]
             assert len(names) == len(set(names))
             assert ("{filename}" in path) == (("filename", "path") in names)
+
+
+def test_the_openapi_document_names_the_headers_that_are_read(server: RunningServer) -> None:
+    paths = json.loads(curl(f"{server.url}/openapi.json").body)["paths"]
+    for method, path, headers in (
+        ("post", "/denoise", {"Idempotency-Key", "Prefer"}),
+        ("put", "/denoise/{filename}", {"Idempotency-Key", "Prefer"}),
+        ("post", "/jobs", {"Idempotency-Key"}),
+        ("put", "/jobs/{id}", {"Idempotency-Key"}),
+        ("get", "/jobs/{id}/events", {"Last-Event-ID"}),
+        ("get", "/jobs/{id}/result", {"Range", "If-Range", "If-None-Match"}),
+        ("head", "/jobs/{id}/result", {"Range", "If-Range", "If-None-Match"}),
+    ):
+        named = {each["name"] for each in paths[path][method]["parameters"] if each["in"] == "header"}
+        assert named == headers, path
+
+
+def test_the_openapi_document_names_what_becomes_of_a_job_meanwhile(server: RunningServer) -> None:
+    paths = json.loads(curl(f"{server.url}/openapi.json").body)["paths"]
+    assert "404" in paths["/denoise"]["post"]["responses"]  # deleted while it waits
+    for part in ("result", "report", "stream"):
+        assert "507" in paths[f"/jobs/{{id}}/{part}"]["get"]["responses"]  # it failed for want of room
 
 
 def test_the_openapi_document_says_where_a_key_is_wanted(server: RunningServer) -> None:

@@ -94,7 +94,21 @@ def test_a_key_that_no_header_can_carry_is_refused_under_its_settings_name(tmp_p
     assert Settings(api_keys_file=path).keys() == ("alpha",)
 
 
-@pytest.mark.parametrize(("name", "value"), [("API_KEYS", "clé"), ("WEIGHTS", "no/such/weights")])
+def test_a_hash_begins_a_comment_in_a_file_alone(tmp_path: Path) -> None:
+    (path := tmp_path / "keys").write_text("#alpha\n  # beta\ngamma#1\n")
+    assert Settings(api_keys="#alpha, #beta").keys() == ("#alpha", "#beta")
+    assert Settings(api_keys="#alpha", api_keys_file=path).keys() == ("#alpha", "gamma#1")
+
+
+@pytest.mark.parametrize("value", [",", " , ,"])
+def test_keys_that_are_set_but_hold_none_open_no_server(value: str, tmp_path: Path) -> None:
+    (path := tmp_path / "keys").write_text("alpha\n")
+    for file in (None, path):
+        with pytest.raises(InvalidOptions, match="api_keys holds no key"):
+            Settings.from_environment({"STRAIGHTPCF_API_KEYS": value}, api_keys_file=file).keys()
+
+
+@pytest.mark.parametrize(("name", "value"), [("API_KEYS", "clé"), ("API_KEYS", ","), ("WEIGHTS", "no/such/weights")])
 def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_weights(
     name: str, value: str, tmp_path: Path
 ) -> None:

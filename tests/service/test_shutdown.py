@@ -60,6 +60,25 @@ def test_who_waits_in_vain_is_told_so_before_a_server_ends(tmp_path: Path) -> No
         assert "Traceback" not in server.log.read_text()
 
 
+def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path: Path) -> None:
+    with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "2"}) as server:
+        host, port = server.url.removeprefix("http://").split(":")
+        forms = (b"", b"Content-Type: multipart/form-data; boundary=b\r\n")
+        uploads = [socket.create_connection((host, int(port)), timeout=20) for _ in forms]
+        for upload, form in zip(uploads, forms, strict=True):
+            upload.sendall(b"POST /jobs HTTP/1.1\r\nHost: x\r\n" + form + b"Content-Length: 100000\r\n\r\n--b\r\n")
+        wait_for(lambda: len(list(server.data_dir.glob("incoming/*"))) == 2)
+        server.process.send_signal(signal.SIGTERM)
+        for upload in uploads:
+            with upload, upload.makefile("rb") as answer:
+                said = answer.read()
+            assert said.startswith(b"HTTP/1.1 503 ")
+            assert b'"code":"server_busy"' in said
+        server.process.wait(timeout=20)
+        assert not server.spooled_files()
+        assert "Traceback" not in server.log.read_text()
+
+
 def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(tmp_path: Path) -> None:
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(30_000), 0.01))
     with run_server(tmp_path) as server:

@@ -1,0 +1,107 @@
+"""gRPC where two things happen at one moment: a cancelled call, a result that is deleted, a server that ends."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+grpc = pytest.importorskip("grpc")
+
+from straightpcf.points.wire import straightpcf_pb2 as pb  # noqa: E402
+from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub  # noqa: E402
+from straightpcf.service.engine import Engine  # noqa: E402
+from tests.service.engines import until  # noqa: E402
+from tests.service.fakes import ObedientBackend  # noqa: E402
+from tests.service.in_process import free_port, serving  # noqa: E402
+from tests.service.test_races import CLOUD, Commit, nothing_is_left, play, willing  # noqa: E402
+
+JOB = pb.JobConfig(filename="a.xyz")
+
+
+async def denoise_parts() -> AsyncIterator[Any]:
+    yield pb.DenoiseRequest(config=pb.DenoiseConfig(job=JOB, return_file=True))
+    yield pb.DenoiseRequest(chunk=CLOUD)
+
+
+async def create_parts(*, stall: bool = False) -> AsyncIterator[Any]:
+    yield pb.CreateJobRequest(config=JOB)
+    yield pb.CreateJobRequest(chunk=CLOUD)
+    if stall:
+        await asyncio.sleep(60)
+
+
+def test_a_call_that_is_cancelled_while_its_job_is_committed_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit = Commit(monkeypatch)
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, ObedientBackend(), grpc_port=(port := free_port())) as (engine, host, _),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            call = DenoiseServiceStub(channel).Denoise(denoise_parts())
+            await until(commit.begun.is_set)
+            call.cancel()
+            await asyncio.sleep(0.2)  # for the server to see it
+            commit.may_end.set()
+            await nothing_is_left(engine)
+
+    play(scenario)
+
+
+@pytest.mark.parametrize("kind", ["Denoise", "DownloadResult"])
+def test_a_result_that_is_deleted_before_it_is_opened_is_not_found(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, willing(), grpc_port=(port := free_port())) as (engine, host, _),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            stub = DenoiseServiceStub(channel)
+            job = await stub.CreateJob(create_parts())
+            await engine.wait(job.id)
+            _delete_between(engine)
+            call: Any = stub.DownloadResult(pb.DownloadResultRequest(id=job.id))
+            if kind == "Denoise":
+                call = stub.Denoise(denoise_parts())
+            with pytest.raises(grpc.RpcError) as caught:
+                _ = [answer async for answer in call]
+            assert caught.value.code().name == "NOT_FOUND"
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def _delete_between(engine: Engine) -> None:
+    found = engine.result
+
+    async def found_and_lost(id: str, *, owner: str = "") -> Any:
+        result = await found(id, owner=owner)
+        await engine.delete(id, owner=owner)
+        return result
+
+    engine.result = found_and_lost  # type: ignore[method-assign]
+
+
+def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, willing(), grpc_port=(port := free_port()), shutdown_seconds=2) as (engine, host, _),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            call: Any = DenoiseServiceStub(channel).CreateJob(create_parts(stall=True))
+            await until(lambda: any((tmp_path / "incoming").iterdir()))
+            engine.drain()
+            with pytest.raises(grpc.RpcError) as caught:
+                await call
+            assert caught.value.code().name == "UNAVAILABLE"
+            assert "shutting down" in caught.value.details()
+            assert not any((tmp_path / "incoming").iterdir())
+
+    play(scenario)

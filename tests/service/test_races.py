@@ -1,0 +1,135 @@
+"""REST where two things happen at one moment: a result that is deleted, a client that goes away."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.store import JobStore
+from tests.service.engines import until
+from tests.service.fakes import CONTENT, ObedientBackend
+from tests.service.in_process import serving
+
+CLOUD = b"0 0 0\n" * 50
+POST = b"POST /denoise?filename=a.xyz HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n%b" % (len(CLOUD), CLOUD)
+
+
+def play(scenario: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(asyncio.wait_for(scenario(), timeout=20))
+
+
+def willing() -> ObedientBackend:
+    backend = ObedientBackend()
+    backend.go.set()
+    backend.finish.set()
+    return backend
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+@pytest.mark.parametrize(("end", "status"), [("deleted", 404), ("expired", 410)])
+def test_a_result_that_is_taken_away_before_it_is_opened_is_a_problem(
+    tmp_path: Path, method: str, end: str, status: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        ttl = 3600.0 if end == "deleted" else 0.01
+        async with (
+            serving(tmp_path, willing(), result_ttl_seconds=ttl) as (engine, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            id = (await http.post("/jobs?filename=a.xyz", content=CLOUD)).json()["id"]
+            await engine.wait(id)
+            found = engine.result
+
+            async def found_and_lost(id: str, *, owner: str = "") -> Any:
+                path, record = await found(id, owner=owner)
+                if end == "deleted":
+                    await engine.delete(id, owner=owner)
+                elif path.exists():
+                    await asyncio.sleep(ttl)
+                    await engine._call(JobStore.expire, rows_after=3600)
+                    path.unlink()
+                return path, record
+
+            engine.result = found_and_lost  # type: ignore[method-assign]
+            answer = await http.request(method, f"/jobs/{id}/result")
+            assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("query", ["", "&report=true"])
+def test_a_job_that_someone_else_deletes_during_its_download_leaves_the_connection_whole(
+    tmp_path: Path, query: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (engine, host, port):
+            delete = engine.delete
+
+            async def late(id: str, *, owner: str = "") -> None:
+                await delete(id, owner=owner)  # someone who was quicker
+                await delete(id, owner=owner)
+
+            engine.delete = late  # type: ignore[method-assign]
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(POST.replace(b"a.xyz", b"a.xyz" + query.encode()))
+            assert CONTENT in await _answer(reader)
+            writer.write(b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert b'"ok"' in await _answer(reader)
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_client_that_goes_away_while_its_job_is_committed_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit = Commit(monkeypatch)
+
+    async def scenario() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (engine, host, port):
+            _, writer = await asyncio.open_connection(host, port)
+            writer.write(POST)
+            await until(commit.begun.is_set)
+            writer.close()
+            await asyncio.sleep(0.2)  # for the server to see it
+            commit.may_end.set()
+            await nothing_is_left(engine)
+
+    play(scenario)
+
+
+class Commit:
+    """Hold a job's commit back, once it is made, until `may_end` is set."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun, self.may_end = threading.Event(), threading.Event()
+        create = JobStore.create
+
+        def slowly(store: JobStore, job: Any) -> Any:
+            made = create(store, job)
+            self.begun.set()
+            self.may_end.wait(10)
+            return made
+
+        monkeypatch.setattr(JobStore, "create", slowly)
+
+
+async def nothing_is_left(engine: Engine) -> None:
+    async with asyncio.timeout(5):
+        while (await engine.list())[0]:
+            await asyncio.sleep(0.01)
+
+
+async def _answer(reader: asyncio.StreamReader) -> bytes:
+    head = await reader.readuntil(b"\r\n\r\n")
+    size = head.lower().split(b"content-length: ")[1].split(b"\r\n")[0]
+    return await reader.readexactly(int(size))

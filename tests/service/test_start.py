@@ -1,0 +1,57 @@
+"""What a server finds when it starts: what it cannot use it says in a line, what it can do without stops it not."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from straightpcf.points.errors import SpoolFull
+from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.store import JobStore
+from tests.conftest import clean_environment
+from tests.service.engines import play, submit
+from tests.service.fakes import ObedientBackend
+
+
+def _damage(folder: Path) -> None:
+    """Spoil pages behind the first: the file still opens."""
+    path = folder / "jobs.sqlite3"
+    JobStore(path).close()
+    with closing(sqlite3.connect(path)) as db:
+        assert db.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
+    with path.open("r+b") as file:
+        file.seek(2 * 4096)
+        file.write(b"\xa5" * (path.stat().st_size - 2 * 4096))
+
+
+def _put_a_file_where_jobs_go(folder: Path) -> None:
+    (folder / "jobs").write_bytes(b"")
+
+
+@pytest.mark.parametrize("spoil", [_damage, _put_a_file_where_jobs_go])
+def test_a_data_directory_that_cannot_be_used_is_said_in_a_line(tmp_path: Path, spoil: Callable[[Path], None]) -> None:
+    spoil(tmp_path)
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
+    done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert f"data_dir is {tmp_path}, which cannot hold jobs: " in done.stderr.replace("\n", "")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_first_sweep_that_fails_is_made_up_for_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(store: JobStore, *, rows_after: float) -> list[str]:
+        raise SpoolFull("the server's disk is full")
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        monkeypatch.undo()
+        await submit(engine)
+        await engine._sweeper.sweep()
+
+    monkeypatch.setattr(JobStore, "expire", full)
+    play(tmp_path, scenario)

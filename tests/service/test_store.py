@@ -1,0 +1,73 @@
+"""The store and the folders by themselves, as servers share them."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from pathlib import Path
+
+from straightpcf.points.errors import InternalError
+from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.jobs.folders import JobFolders
+from straightpcf.service.jobs.record import NewJob
+from straightpcf.service.jobs.store import JobStore
+
+LONG_AGO = time.time() - 2 * 3600
+
+
+def new_job(id: str, folder: str) -> NewJob:
+    return NewJob(
+        id=id, owner="", folder=folder, name=None, format=None, options=DenoiseOptions(), bytes=1, weight=1, spool=2,
+        digest=folder,
+    )  # fmt: skip
+
+
+def test_a_fence_is_void_for_every_later_job_of_its_id_too(tmp_path: Path) -> None:
+    with closing(JobStore(tmp_path / "jobs")) as here, closing(JobStore(tmp_path / "jobs")) as there:
+        held: list[int] = []
+        for round in range(4):
+            there.create(new_job("foo", folder=str(round)))
+            for _ in range(round + 1):  # an attempt that is put back
+                claim = here.claim("here", 15.0)
+                assert claim is not None
+                assert there.extend([("foo", fence) for fence in held], 15.0) == ["lost"] * len(held)
+                for fence in held:
+                    assert not there.begin("foo", fence, device="cpu")
+                    assert not there.fail("foo", fence, InternalError("old"), expires_in=60)
+                assert here.extend([("foo", claim.fence)], 15.0) == ["held"]
+                held.append(claim.fence)
+                assert here.release("foo", claim.fence, "again", expires_in=60)
+            there.delete("foo")
+        assert len(set(held)) == len(held)
+
+
+def test_the_locks_of_dead_servers_are_removed_also_of_those_that_held_no_job(tmp_path: Path) -> None:
+    locks = tmp_path / "servers"
+    with closing(JobFolders(tmp_path)) as ours, closing(JobFolders(tmp_path)) as other:
+        for name in ("dead", "dead-with-jobs", "just-begun"):
+            (locks / f"{name}.lock").touch()
+        for path in locks.iterdir():
+            if path.stem != "just-begun":  # which may be about to lock it
+                os.utime(path, (LONG_AGO, LONG_AGO))
+        assert ours.dead_servers({"dead-with-jobs", other.server}) == ["dead-with-jobs"]
+        assert {path.stem for path in locks.iterdir()} == {ours.server, other.server, "just-begun"}
+
+
+def test_an_upload_that_nobody_finished_is_dropped_and_a_folder_beside_it_is_let_be(tmp_path: Path) -> None:
+    with closing(JobFolders(tmp_path)) as folders:
+        (tmp_path / "incoming" / "folder").mkdir()
+        (tmp_path / "incoming" / "upload").touch()
+        (tmp_path / "jobs" / "job").mkdir()
+        for path in (*(tmp_path / "incoming").iterdir(), tmp_path / "jobs" / "job"):
+            os.utime(path, (LONG_AGO, LONG_AGO))
+        assert folders.orphans() == ["job"]
+        assert [path.name for path in (tmp_path / "incoming").iterdir()] == ["folder"]
+
+
+def test_a_store_that_is_opened_again_is_not_written_to(tmp_path: Path) -> None:
+    with closing(JobStore(path := tmp_path / "jobs.sqlite3")):
+        log = path.with_name("jobs.sqlite3-wal")
+        written = log.read_bytes()
+        JobStore(path).close()
+        assert log.read_bytes() == written
