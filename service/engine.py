@@ -93,6 +93,11 @@ class Engine:
         """Tell whether a job that is submitted now finds a warm worker."""
         return bool(self.backend.devices) and not self.draining
 
+    @property
+    def ending(self) -> bool:
+        """Tell whether this server ends so soon that who still waits has to be answered now."""
+        return self.draining and self.patience_seconds < min(FAREWELL_SECONDS, self.limits.shutdown_seconds / 2)
+
     async def start(self) -> None:
         """Open the store, take back what dead servers left, and begin to start the backend; `ready` says when it is."""
         self._folders = await asyncio.to_thread(JobFolders, self._data_dir)
@@ -331,7 +336,7 @@ class Engine:
 
     async def _further(self, news: asyncio.Event, seconds: float = POLL_SECONDS) -> None:
         """Return when there may be something new; raises ServerBusy when this server is about to end."""
-        if self.draining and self.patience_seconds < min(FAREWELL_SECONDS, self.limits.shutdown_seconds / 2):
+        if self.ending:
             raise ServerBusy("the server is shutting down; a job goes on when it is back, unless it ends with its call")
         await _first(news, seconds)
 

@@ -15,7 +15,7 @@ from starlette.requests import Request
 from straightpcf.points.errors import InvalidOptions, InvalidRequest, ServerBusy, UnknownFormat
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.disposition import disposition_name
-from straightpcf.service.engine import FAREWELL_SECONDS, Engine
+from straightpcf.service.engine import Engine
 
 __all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "receive_upload"]
 
@@ -56,10 +56,9 @@ async def receive_upload(request: Request, target: Path, *, limits: Limits) -> U
 async def in_time(engine: Engine, receiving: Coroutine[Any, Any, _T]) -> _T:
     """Return what a body that comes in is; raises ServerBusy a moment before this server ends, and reads no further."""
     task = asyncio.ensure_future(receiving)
-    farewell = min(FAREWELL_SECONDS, engine.limits.shutdown_seconds / 2)
     try:
         while not task.done():
-            if engine.draining and engine.patience_seconds < farewell:
+            if engine.ending:
                 raise ServerBusy("the server is shutting down, and the body has not come to its end")
             await asyncio.wait([task], timeout=LOOK_SECONDS)
         return task.result()
