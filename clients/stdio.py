@@ -12,8 +12,6 @@ from typing import BinaryIO, TextIO
 
 from straightpcf.clients.atomic import place_named
 from straightpcf.points.errors import InvalidRequest
-from straightpcf.points.formats import recognised
-from straightpcf.points.formats.base import HEAD_BYTES
 
 __all__ = ["STDIO", "input_file", "output_file", "stdin", "stdout"]
 
@@ -33,6 +31,9 @@ def stdout() -> BinaryIO:
 @contextmanager
 def input_file(source: Path, name: str | None) -> Iterator[Path]:
     """Lend the file to read, which for - holds what stdin had; name: what its format is told by."""
+    from straightpcf.points.formats import recognised
+    from straightpcf.points.formats.base import HEAD_BYTES
+
     if source != STDIO:
         if not source.is_file():
             raise FileNotFoundError(f"{source} is no file")
