@@ -77,8 +77,9 @@ def interruptible() -> Iterator[None]:
     """Take SIGTERM, and a terminal that is closed, for Ctrl-C, so that what was begun here and on a server is ended."""
     import signal
 
-    hangup = [number for name in ("SIGHUP",) if (number := getattr(signal, name, None))]  # Windows has none
-    ends = [signal.SIGTERM, *(number for number in hangup if signal.getsignal(number) != signal.SIG_IGN)]  # nohup
+    ends = [signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # Windows has none; nohup
+        ends.append(signal.SIGHUP)
     before = {number: signal.signal(number, signal.default_int_handler) for number in ends}
     try:
         yield

@@ -11,7 +11,7 @@ import typer
 
 from straightpcf.clients.atomic import check_target
 from straightpcf.clients.console import interruptible, print_json, print_table, progress_bar, show_noise
-from straightpcf.clients.stdio import stdin, stdout
+from straightpcf.clients.stdio import STDIO, stdin, stdout
 from straightpcf.points.errors import InvalidOptions
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def submit(
         raise InvalidOptions(f"--name is of one file, and there are {len(sources)}")
     with connect(url, api_key) as client:
         for source in sources:
-            content: Any = stdin().read() if str(source) == "-" else source
+            content: Any = stdin().read() if source == STDIO else source
             job = client.jobs.create(
                 content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
                 format=format, name=name, id=id,
@@ -144,18 +144,17 @@ def result(
     as_json: AsJson = False,
 ) -> None:
     """Wait for a job and download its result, whole and checked."""
-    to_stdout = str(target) == "-"
-    out = stdout() if to_stdout else None
+    out = stdout() if target == STDIO else None
     if out is None:
         check_target(target)
     with connect(url, api_key) as client, progress_bar(id) as show:
         job = client.jobs.get(id)
         if not job.info.finished:
             job.wait(on_progress=show)
-        found = job.result(None if to_stdout else target)
+        found = job.result(target if out is None else None)
         if out is not None:
             out.write(found.read())
-    if as_json and not to_stdout:
+    if as_json and out is None:
         print_json(found.job.json["report"])
     else:
         show_noise(target, found.report)

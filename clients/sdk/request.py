@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from straightpcf.clients.atomic import check_target
 from straightpcf.points.errors import InvalidCloud, InvalidRequest, NotFound
-from straightpcf.points.formats import FORMATS, format_named, format_wanted, recognised
+from straightpcf.points.formats import format_by_suffix, format_named, format_wanted, recognised
 from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE, MAX_PAGE_SIZE, STATES
@@ -209,7 +209,7 @@ def _job(id: str, part: str = "") -> str:
 def check_suffix(target: Path, format: str) -> None:
     """Raise InvalidRequest where a file of that format would be called another's; one text table is like another."""
     of_result = format_named(format)
-    named = next((other for other in FORMATS if target.suffix.lower() in other.suffixes), of_result)
+    named = format_by_suffix(target.name) or of_result
     if named is not of_result and {named.media_type[:5], of_result.media_type[:5]} != {"text/"}:
         raise InvalidRequest(
             f"the result is {format}, and {target.name} is a name for {named.name}: "

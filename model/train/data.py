@@ -138,6 +138,17 @@ class Surface:
     xyz: npt.NDArray[np.float64]
     normals: npt.NDArray[np.float64]
 
+    @classmethod
+    def of(
+        cls,
+        clouds: Iterable[npt.NDArray[np.float32]],
+        normals: npt.NDArray[np.float32] | None,
+        surface: npt.NDArray[np.float32] | None,
+    ) -> Surface:
+        """Take a shape's `surface`, or else its cloud of most points; with normals that are known, or computed."""
+        finest = (max(clouds, key=len) if surface is None else surface).astype(np.float64)
+        return cls(finest, recompute_normals(finest, 0 * finest) if normals is None else normals.astype(np.float64))
+
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.xyz)
@@ -203,13 +214,12 @@ class PatchSource:
         self.surfaces: list[Surface] = []
         unknown = [None] * len(shapes)
         for shape, given, surface in zip(shapes, normals or unknown, surfaces or unknown, strict=True):
-            finest = (max(shape, key=len) if surface is None else surface).astype(np.float64)
-            across = given.astype(np.float64) if given is not None else recompute_normals(finest, 0 * finest)
+            own = Surface.of(shape, given, surface)
             for cloud in shape:
                 wide = cloud.astype(np.float64)
                 frame = CloudFrame.of(wide)
                 self.clouds.append(frame.enter(wide))
-                self.surfaces.append(Surface(frame.enter(finest), across))
+                self.surfaces.append(Surface(frame.enter(own.xyz), own.normals))
         self.passed: PatchMaker | None = None  # draws patches of clouds after passes
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
         self.zooms = np.stack([self._zooms(cloud, tree) for cloud, tree in zip(self.clouds, self._trees, strict=True)])

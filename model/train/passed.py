@@ -16,7 +16,6 @@ from torch import nn
 
 from straightpcf.model.filter import Filter, Run, load_filter
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.normals import recompute_normals
 from straightpcf.model.tiles import Tiling
 from straightpcf.model.train.data import (
     PATCH_SIZE,
@@ -171,14 +170,11 @@ def _training_clouds(archive: Path) -> dict[str, list[npt.NDArray[np.float64]]]:
 def _surface(archive: Path, shape: str) -> Surface:
     """Return the finest cloud of a shape with its normals, in its own coordinates."""
     with np.load(archive, allow_pickle=False) as file:
-        clouds = [name for name in file.files if name.startswith(f"{shape}/") and not name.endswith("/normals")]
-        if not clouds:
-            raise InvalidOptions(f"{archive} has no shape {shape}, of which there are clouds after a pass")
-        own = f"{shape}/surface"
-        finest = (file[own] if own in clouds else max((file[name] for name in clouds), key=len)).astype(np.float64)
-        known = f"{shape}/normals"
-        normals = file[known].astype(np.float64) if known in file.files else recompute_normals(finest, 0 * finest)
-        return Surface(finest, normals)
+        clouds = {name.split("/")[1]: file[name] for name in file.files if name.startswith(f"{shape}/")}
+    normals, surface = clouds.pop("normals", None), clouds.pop("surface", None)
+    if not clouds:
+        raise InvalidOptions(f"{archive} has no shape {shape}, of which there are clouds after a pass")
+    return Surface.of(clouds.values(), normals, surface)
 
 
 def _main() -> None:

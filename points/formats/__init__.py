@@ -31,6 +31,7 @@ __all__ = [
     "FORMATS",
     "Format",
     "estimate_points",
+    "format_by_suffix",
     "format_for",
     "format_named",
     "format_wanted",
@@ -97,13 +98,18 @@ def format_named(name: str) -> Format:
 
 def format_for(filename: str) -> Format:
     """Return the format that the suffix names; raises UnknownFormat."""
-    suffix = PurePath(filename).suffix.lower()
-    for format in FORMATS:
-        if suffix in format.suffixes:
-            return format
+    if (format := format_by_suffix(filename)) is not None:
+        return format
+    name = PurePath(filename)
     raise UnknownFormat(
-        f"no format has the suffix {suffix[:40]!r} of {PurePath(filename).name[:80]}; there are {_known()}"
+        f"no format has the suffix {name.suffix.lower()[:40]!r} of {name.name[:80]}; there are {_known()}"
     )
+
+
+def format_by_suffix(filename: str) -> Format | None:
+    """Return the format that the suffix names, if one does."""
+    suffix = PurePath(filename).suffix.lower()
+    return next((format for format in FORMATS if suffix in format.suffixes), None)
 
 
 def format_wanted(target: str, source: str | None) -> str | None:
@@ -111,9 +117,8 @@ def format_wanted(target: str, source: str | None) -> str | None:
 
     Raises UnknownFormat.
     """
-    suffixes = [PurePath(name or "").suffix.lower() for name in (target, source)]
-    known = any(suffixes[0] in format.suffixes for format in FORMATS)
-    return None if suffixes[0] == suffixes[1] and not known else format_for(target).name
+    is_same = PurePath(target).suffix.lower() == PurePath(source or "").suffix.lower()
+    return None if is_same and format_by_suffix(target) is None else format_for(target).name
 
 
 def recognised(head: bytes, called: str | None) -> Format:
@@ -131,11 +136,10 @@ def recognised(head: bytes, called: str | None) -> Format:
     for ending, why in _NOT_OURS.items():
         if name.lower().endswith(ending):
             raise UnsupportedCloud(f"{name[:80]}: {why}")
-    for format in FORMATS:
-        if suffix in format.suffixes:
-            if not format.has_magic:
-                return format
-            raise UnknownFormat(f"{begins}: it is no {format.name} file, whatever its suffix says")
+    if (named := format_by_suffix(name)) is not None:
+        if not named.has_magic:
+            return named
+        raise UnknownFormat(f"{begins}: it is no {named.name} file, whatever its suffix says")
     wants = "and its suffix names none" if suffix else "so it needs a name with a suffix that says its format"
     raise UnknownFormat(f"{begins}, {wants}; there are {_known()}")
 

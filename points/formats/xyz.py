@@ -195,9 +195,8 @@ def _table(raw: bytes, layout: Layout, max_points: int) -> tuple[_Offsets, _Offs
             token = table.first + column
             values, bad = as_numbers(raw, table.starts[token], table.ends[token])
             if bad is None:
-                exact = column not in layout.axes and _is_beyond_doubles(values)
-                whole, bad = as_integers(raw, table.starts[token], table.ends[token], _WHOLE) if exact else (values, 0)
-                parts[column].append(whole if bad is None else values)
+                has_ids = column not in layout.axes and _is_beyond_doubles(values)
+                parts[column].append(_whole(table, token, values) if has_ids else values)
             elif column in layout.axes:
                 text = raw[table.starts[token[bad]] : table.ends[token[bad]]]
                 raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number")
@@ -213,6 +212,14 @@ def _table(raw: bytes, layout: Layout, max_points: int) -> tuple[_Offsets, _Offs
 def _is_beyond_doubles(values: npt.NDArray[np.float64]) -> bool:
     """Say of (K,) numbers whether they are whole and some too large for float64 to tell from the next: times, ids."""
     return bool(np.isfinite(values).all() and (np.abs(values) >= 2**53).any() and (values == np.rint(values)).all())
+
+
+def _whole(
+    table: Lines, token: npt.NDArray[np.int64], values: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64] | npt.NDArray[np.int64]:
+    """Read (K,) tokens again as int64; their values as they are where one is larger than that."""
+    exact, bad = as_integers(table.raw, table.starts[token], table.ends[token], _WHOLE)
+    return exact if bad is None else values
 
 
 def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:

@@ -45,10 +45,7 @@ def test_a_call_that_is_cancelled_while_its_job_is_committed_leaves_none(
             grpc.aio.insecure_channel(f"{host}:{port}") as channel,
         ):
             call = DenoiseServiceStub(channel).Denoise(denoise_parts())
-            await until(commit.begun.is_set)
-            call.cancel()
-            await asyncio.sleep(0.2)  # for the server to see it
-            commit.may_end.set()
+            await commit.left_alone(call.cancel)
             await nothing_is_left(engine)
 
     play(scenario)

@@ -73,19 +73,25 @@ def run(backend: LocalBackend, jobs: int = 1) -> list[FileReport]:
     return asyncio.run(scenario())
 
 
-def test_a_worker_that_dies_is_told_and_the_next_job_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
+def run_over_a_death() -> LocalBackend:
+    """Run a job whose worker dies, and one that another worker does."""
 
-    async def scenario() -> None:
+    async def scenario() -> LocalBackend:
         backend = LocalBackend([SPEC])
         await backend.start()
         with pytest.raises(WorkerDied):
             await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5)
         assert await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5) == REPORT
-        assert (workers.started, backend.restarts) == (2, 1)
         await backend.stop()
+        return backend
 
-    asyncio.run(scenario())
+    return asyncio.run(scenario())
+
+
+def test_a_worker_that_dies_is_told_and_the_next_job_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
+    backend = run_over_a_death()
+    assert (workers.started, backend.restarts) == (2, 1)
 
 
 def test_many_jobs_share_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,16 +115,7 @@ def test_a_worker_that_cannot_be_replaced_at_this_moment_is_replaced_later(
     faults = [OSError(errno.EMFILE, "Too many open files"), BlockingIOError(errno.EAGAIN, "no process")]
     monkeypatch.setattr(local, "WorkerProcess", workers := Workers(*faults, deaths=1))
     monkeypatch.setattr(local, "FIRST_RESTART_DELAY_SECONDS", 0.01)
-
-    async def scenario() -> None:
-        backend = LocalBackend([SPEC])
-        await backend.start()
-        with pytest.raises(WorkerDied):
-            await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5)
-        assert await asyncio.wait_for(backend.run(JOB, Deaf()), timeout=5) == REPORT
-        assert (workers.started, workers.faults, backend.restarts) == (2, [], 1)
-        await backend.stop()
-
-    asyncio.run(scenario())
+    backend = run_over_a_death()
+    assert (workers.started, workers.faults, backend.restarts) == (2, [], 1)
     assert "Too many open files" in caplog.text
     assert "no process" in caplog.text

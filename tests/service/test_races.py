@@ -98,10 +98,7 @@ def test_a_client_that_goes_away_while_its_job_is_committed_leaves_none(
         async with serving(tmp_path, ObedientBackend()) as (engine, host, port):
             _, writer = await asyncio.open_connection(host, port)
             writer.write(POST)
-            await until(commit.begun.is_set)
-            writer.close()
-            await asyncio.sleep(0.2)  # for the server to see it
-            commit.may_end.set()
+            await commit.left_alone(writer.close)
             await nothing_is_left(engine)
 
     play(scenario)
@@ -121,6 +118,13 @@ class Commit:
             return made
 
         monkeypatch.setattr(JobStore, "create", slowly)
+
+    async def left_alone(self, leave: Callable[[], object]) -> None:
+        """Let who asked for the job leave while it is being committed."""
+        await until(self.begun.is_set)
+        leave()
+        await asyncio.sleep(0.2)  # for the server to see it
+        self.may_end.set()
 
 
 async def nothing_is_left(engine: Engine) -> None:
