@@ -105,6 +105,11 @@ class Batch:
     normals: torch.Tensor
     passed: torch.Tensor
 
+    @classmethod
+    def joined(cls, first: Batch, second: Batch) -> Batch:
+        """Return the patches of both, those of the first before."""
+        return cls(*map(torch.cat, zip(first._tensors(), second._tensors(), strict=True)))
+
     def at(self, time: torch.Tensor) -> torch.Tensor:
         """Return x_t = (1 - t) x_0 + t y, (B, P, 3)."""
         return torch.lerp(self.noisy, self.clean, time)

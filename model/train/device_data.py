@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from straightpcf.model.train.data import (
     NEAR_WEIGHT,
     NOISE_STD,
     OTHER_NOISE,
+    PASSED,
     PATCH_SIZE,
     REACH,
     SCALES,
@@ -28,9 +30,11 @@ from straightpcf.model.train.data import (
     UNEQUAL,
     Batch,
     PatchSource,
+    Surface,
     gathered,
     reach_of,
 )
+from straightpcf.model.train.passed import SHORTEST, PassedClouds
 
 __all__ = ["DevicePatchSource", "random_rotations"]
 
@@ -49,32 +53,31 @@ class DevicePatchSource:
         self._clouds = _padded(source.clouds, device)
         self._noise = torch.from_numpy(FIRST_NOISE).float().to(device)
         self._zooms = torch.from_numpy(source.zooms).float().to(device)
-        self._surfaces = _repeated([surface.xyz for surface in source.surfaces], device)
-        self._normals = _repeated([surface.normals for surface in source.surfaces], device)
-        pairs = zip(source.clouds, source.surfaces, strict=True)
-        reach = [reach_of(REACH * PATCH_SIZE / len(cloud), len(surface.xyz)) for cloud, surface in pairs]
-        self._reach, self._farthest = torch.tensor(reach, device=device), max(reach)
+        self._surfaces = _Surfaces(source.surfaces, range(len(source.clouds)), source.clouds, device)
+        self._passed = _Passed(source.passed, device) if isinstance(source.passed, PassedClouds) else None
 
     def draw(self, batch_size: int) -> Batch:
-        """Draw an augmented batch of `batch_size` patches."""
+        """Draw an augmented batch of `batch_size` patches; of clouds after passes, if any, are `PASSED` of them."""
+        after = round(PASSED * batch_size) if self._passed is not None else 0
+        if self._passed is None or not after:
+            return self._noisy(batch_size, FIRST_PASSES)
+        return Batch.joined(self._noisy(batch_size - after, FIRST_PASSES / (1 - PASSED)), self._passed.draw(after))
+
+    def _noisy(self, batch_size: int, first_passes: float) -> Batch:
+        """Draw patches of clouds with drawn noise, that share of them as first passes show them."""
         device = self._clouds.device
         which = torch.randint(len(self._clouds), (batch_size,), device=device)
         seeds = (torch.rand(batch_size, device=device) * self._counts[which]).long()
         clouds = self._clouds[which]  # (B, N, 3)
-        squared = (clouds - gathered(clouds, seeds[:, None])).square().sum(dim=2)
-        near = squared.topk(self._candidates, dim=1, largest=False).indices  # (B, C), the seed first
-        clean = gathered(clouds, near)
-        time, scale = self._shown(which)
+        seed = gathered(clouds, seeds[:, None])
+        clean = gathered(clouds, _nearest(clouds, seed, self._candidates))  # the seed first
+        time, scale = self._shown(which, first_passes)
         noisy = clean + NOISE_STD / scale * _noise(batch_size, clean.shape[1], device)
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
-        squared = (here - origin).square().sum(dim=2)  # cut at x_t, as PatchSource does
-        inside = squared.topk(PATCH_SIZE, dim=1, largest=False).indices
-        turn = torch.empty(batch_size, PATCH_SIZE, device=device).exponential_()
-        turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
-        inside = inside.gather(1, turn.argsort(dim=1))
+        inside = _near_first(_nearest(here, origin, PATCH_SIZE))  # cut at x_t, as PatchSource does
         noisy, here, clean = (gathered(part, inside) for part in (noisy, here, clean))
-        surface, normals = self._around(which, gathered(clouds, seeds[:, None]))
+        surface, normals = self._surfaces.around(which, seed)
         turn = random_rotations(batch_size, device)
         noisy, here, clean, surface = ((part - origin) @ turn * scale for part in (noisy, here, clean, surface))
         batch = Batch(noisy, clean, time, clean, surface, normals @ turn, torch.zeros_like(time))
@@ -84,24 +87,89 @@ class DevicePatchSource:
         noisy = torch.where(early, torch.lerp(touched, here, 1 / (1 - time)), noisy)
         return replace(batch, noisy=noisy, clean=touched)
 
-    def _shown(self, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _shown(self, which: torch.Tensor, first_passes: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw the times and sizes, (B, 1, 1), in which patches of the clouds numbered `which` (B,) are shown."""
         first, time, scale = torch.rand(3, len(which), device=which.device)
         scale = SCALES[0] + (SCALES[1] - SCALES[0]) * scale
         level = torch.randint(len(self._noise), which.shape, device=which.device)
         zoomed = scale * self._zooms[which, level]
-        early = first < FIRST_PASSES
+        early = first < first_passes
         time = torch.where(early, (1 - zoomed * self._noise[level] / NOISE_STD).clamp(min=EARLIEST), time)
         return time.view(-1, 1, 1), torch.where(early, zoomed, scale).view(-1, 1, 1)
 
-    def _around(self, which: torch.Tensor, seeds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+
+class _Passed:
+    """Draw what `PassedClouds.patch` draws; the surfaces are those of the shapes, the seeds are brought to them."""
+
+    def __init__(self, passed: PassedClouds, device: torch.device) -> None:
+        clouds = passed.clouds
+        self._distance: Callable[[torch.Tensor], torch.Tensor] = passed.distance
+        self._counts = torch.tensor([len(cloud.xyz) for cloud in clouds], device=device)
+        self._clouds = _padded([cloud.xyz for cloud in clouds], device)
+        self._centres = torch.from_numpy(np.stack([cloud.frame.centre for cloud in clouds])).float().to(device)
+        self._radii = torch.tensor([cloud.frame.radius for cloud in clouds], dtype=torch.float32, device=device)
+        shapes = list({id(cloud.surface): cloud.surface for cloud in clouds}.values())
+        number = {id(surface): n for n, surface in enumerate(shapes)}
+        self._surfaces = _Surfaces(
+            shapes, [number[id(cloud.surface)] for cloud in clouds], [c.xyz for c in clouds], device
+        )
+
+    def draw(self, batch_size: int) -> Batch:
+        device = self._clouds.device
+        which = torch.randint(len(self._clouds), (batch_size,), device=device)
+        seeds = (torch.rand(batch_size, device=device) * self._counts[which]).long()
+        clouds = self._clouds[which]
+        origin = gathered(clouds, seeds[:, None])
+        inside = _near_first(_nearest(clouds, origin, PATCH_SIZE))
+        scale = SCALES[0] + (SCALES[1] - SCALES[0]) * torch.rand(batch_size, 1, 1, device=device)
+        turn = random_rotations(batch_size, device)
+        here = (gathered(clouds, inside) - origin) @ turn * scale
+        with torch.no_grad():
+            time = 1 - self._distance(here).view(-1, 1, 1).clamp(min=SHORTEST)
+        centre, radius = self._centres[which, None], self._radii[which, None, None]
+        surface, normals = self._surfaces.around(which, origin * radius + centre)
+        surface = ((surface - centre) / radius - origin) @ turn * scale
+        batch = Batch(here, here, time, here, surface, normals @ turn, torch.ones_like(time))
+        clean = batch.touching(here)
+        return replace(batch, noisy=torch.lerp(clean, here, 1 / (1 - time)), clean=clean)
+
+
+class _Surfaces:
+    """The surfaces of clouds, of which some may share one: cloud n lies on number[n] of `surfaces`."""
+
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        number: Sequence[int],
+        clouds: Sequence[npt.NDArray[np.float64]],
+        device: torch.device,
+    ) -> None:
+        self._number = torch.tensor(number, device=device)
+        self._xyz = _repeated([surface.xyz for surface in surfaces], device)
+        self._normals = _repeated([surface.normals for surface in surfaces], device)
+        pairs = zip(number, clouds, strict=True)
+        reach = [reach_of(REACH * PATCH_SIZE / len(cloud), len(surfaces[n].xyz)) for n, cloud in pairs]
+        self._reach, self._farthest = torch.tensor(reach, device=device), max(reach)
+
+    def around(self, which: torch.Tensor, seeds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Do for seeds (B, 1, 3) on the clouds numbered `which` (B,) what `Surface.around` does."""
-        surface, normals = self._surfaces[which], self._normals[which]
-        squared = (surface - seeds).square().sum(dim=2)
-        near = squared.topk(self._farthest, dim=1, largest=False).indices
-        places = torch.linspace(0, 1, AROUND, device=squared.device) * (self._reach[which, None] - 1)
+        surface, normals = self._xyz[self._number[which]], self._normals[self._number[which]]
+        near = _nearest(surface, seeds, self._farthest)
+        places = torch.linspace(0, 1, AROUND, device=near.device) * (self._reach[which, None] - 1)
         near = near.gather(1, places.long())
         return gathered(surface, near), gathered(normals, near)
+
+
+def _nearest(points: torch.Tensor, seeds: torch.Tensor, count: int) -> torch.Tensor:
+    """Return which of points (B, N, 3) are the `count` nearest to seeds (B, 1, 3), the nearest first: (B, count)."""
+    return (points - seeds).square().sum(dim=2).topk(count, dim=1, largest=False).indices
+
+
+def _near_first(inside: torch.Tensor) -> torch.Tensor:
+    """Order points sorted by distance, (B, PATCH_SIZE), as `near_first` does."""
+    turn = torch.empty(inside.shape, device=inside.device).exponential_()
+    turn[:, : int(NEAR_SHARE * PATCH_SIZE)] /= NEAR_WEIGHT
+    return inside.gather(1, turn.argsort(dim=1))
 
 
 def _noise(batch_size: int, count: int, device: torch.device) -> torch.Tensor:

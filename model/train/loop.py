@@ -76,7 +76,7 @@ def train(
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
     data: the archives of clean clouds (`PatchSource.read`), which a run that goes on may change; passed: of stage cvm,
-    on a CPU, archives of their shapes as later passes see them (`write_passed`).
+    archives of their shapes as later passes see them (`write_passed`).
     init: the state to start from on a fresh run: the stage before ("cvm" and "dm" need it), or the same stage, or
     weights that ship. distance: one of these whose DistanceModule to start from instead. rows: points of a patch in the
     loss. settled: without dropout, BatchNorm's statistics kept as they are: for a network that was trained before. The
@@ -90,8 +90,8 @@ def train(
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
-    if passed and (stage != "cvm" or device != "cpu"):
-        raise InvalidOptions(f"clouds after passes are for stage 'cvm' on a CPU, not for {stage!r} on {device!r}")
+    if passed and stage != "cvm":
+        raise InvalidOptions(f"clouds after passes are for stage 'cvm', not for {stage!r}")
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)

@@ -13,7 +13,7 @@ from functools import cache
 import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train.data import NOISE_STD, TOUCH_UNTIL, Batch
+from straightpcf.model.train.data import NOISE_STD, TOUCH_UNTIL, Batch, gathered
 from straightpcf.model.turns import turns
 
 __all__ = ["LAMBDA_1", "LAMBDA_2", "across", "coupled_loss", "distance_loss", "precision", "velocity_loss"]
@@ -91,12 +91,15 @@ def across(batch: Batch, there: torch.Tensor, weight: torch.Tensor) -> torch.Ten
 
     Where along it a point came from is not to be told after a pass: what is left of the noise is no noise.
     """
-    if batch.passed.is_cuda or not batch.passed.any():  # on CUDA there are none, and a graph has no branches
-        return weight
-    for patch in batch.passed.flatten().nonzero().flatten().tolist():
-        near = torch.cdist(there[patch], batch.surface[patch]).argmin(dim=1)
-        normal = batch.normals[patch][near]
-        weight[patch] = _ALONG * torch.eye(3) + (1 - _ALONG) * normal[:, :, None] * normal[:, None, :]
+    if batch.passed.is_cuda:  # a graph has no branches: all are weighed, in one
+        parts = [slice(None)]
+    else:
+        parts = [slice(n, n + 1) for n in batch.passed.flatten().nonzero().flatten().tolist()]
+    for part in parts:
+        near = torch.cdist(there[part], batch.surface[part]).argmin(dim=2)
+        normal = gathered(batch.normals[part], near)
+        flat = _ALONG * torch.eye(3, device=normal.device) + (1 - _ALONG) * normal[..., :, None] * normal[..., None, :]
+        weight[part] = torch.where(batch.passed[part, ..., None] > 0, flat, weight[part])
     return weight
 
 

@@ -13,8 +13,10 @@ from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import train
 from straightpcf.model.train.data import PASSED, PATCH_SIZE, PatchSource, held_out_shapes
+from straightpcf.model.train.device_data import DevicePatchSource
 from straightpcf.model.train.losses import across, precision
-from straightpcf.model.train.passed import PassedClouds, training_patches, write_passed
+from straightpcf.model.train.passed import PassedClouds, training_patches
+from straightpcf.model.train.record import write_passed
 from straightpcf.points.errors import InvalidOptions
 from tests.clouds import distance_to_torus
 
@@ -48,9 +50,14 @@ def test_recorded_clouds_lie_about_their_shapes_and_none_is_held_out(passed: Pat
             assert np.abs(np.median(off)) < 0.1
 
 
-def test_their_points_are_led_across_the_surface_only(passed: Path, data: Path, network: StraightPCF) -> None:
+@pytest.mark.parametrize("on_device", [False, True])
+def test_their_points_are_led_across_the_surface_only(
+    passed: Path, data: Path, network: StraightPCF, *, on_device: bool
+) -> None:
     source = training_patches([data], [passed], network.distance_module)
-    batch = source.draw(np.random.default_rng(0), 32)
+    torch.manual_seed(0)
+    device = torch.device("cpu")
+    batch = DevicePatchSource(source, device).draw(32) if on_device else source.draw(np.random.default_rng(0), 32)
     is_passed = batch.passed.flatten() > 0
     assert is_passed.float().mean().item() == pytest.approx(PASSED, abs=0.15)
     here = batch.at(batch.time)
@@ -74,6 +81,24 @@ def test_the_time_of_their_patches_is_what_the_distance_module_says(passed: Path
     np.testing.assert_allclose((1 - time) * noisy + time * clean, here, atol=1e-12)
 
 
+def test_those_drawn_on_the_device_are_the_same_clouds_in_the_same_size(passed: Path, data: Path) -> None:
+    source = training_patches([data], [passed], lambda x: torch.full((len(x), 1), 0.3))  # type: ignore[arg-type]
+    torch.manual_seed(0)
+    ours = DevicePatchSource(source, torch.device("cpu")).draw(64)
+    is_passed = ours.passed.flatten() > 0
+    assert is_passed.sum() == PASSED * 64
+    torch.testing.assert_close(ours.time[is_passed], torch.full((16, 1, 1), 0.7))
+    rng = np.random.default_rng(0)
+    assert source.passed is not None
+    host = [source.passed.patch(rng) for _ in range(64)]
+    for part, measured in (("noisy", 0), ("clean", 1), ("drawn", 3), ("surface", 4)):
+        of_ours = getattr(ours, part)[is_passed].norm(dim=2).mean()
+        assert of_ours == pytest.approx(np.mean([np.linalg.norm(p[measured], axis=1).mean() for p in host]), rel=0.1)
+    ways = [np.linalg.norm(patch[1] - patch[3], axis=1).mean() for patch in host]
+    found = (ours.clean - ours.drawn)[is_passed].norm(dim=2).mean()
+    assert found == pytest.approx(np.mean(ways), rel=0.15)
+
+
 def test_errors_along_the_surface_hardly_count_there(data: Path) -> None:
     batch = PatchSource.read(data).draw(np.random.default_rng(1), 2)
     weight = precision(batch, PATCH_SIZE)
@@ -91,7 +116,7 @@ def test_a_run_takes_them_and_its_team_too(passed: Path, data: Path, tmp_path: P
     wanted = {"data": data, "iterations": 2, "batch_size": 2, "threads": 1, "init": first}
     state = train("cvm", run_dir=tmp_path / "cvm", passed=[passed], processes=2, **wanted)  # type: ignore[arg-type]
     assert state.is_file()
-    with pytest.raises(InvalidOptions, match="for stage 'cvm' on a CPU"):
+    with pytest.raises(InvalidOptions, match="are for stage 'cvm'"):
         train("dm", run_dir=tmp_path / "dm", passed=[passed], **wanted)  # type: ignore[arg-type]
 
 
