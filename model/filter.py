@@ -54,7 +54,7 @@ class FinishedPatch:
 
     indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
     final: whether this is known to be the last pass, which `auto` finds out only afterwards;
-    progress: 0..1, of the whole job as far as it can be foreseen.
+    progress: 0..1, of the whole job as far as it can be foreseen; it never falls.
     """
 
     indices: npt.NDArray[np.int64]
@@ -191,7 +191,7 @@ class Filter:
         *,
         on_progress: Callable[[float], None] | None = None,
     ) -> DenoiseResult:
-        """Move (N, 3) points to the surface; an exception raised by on_progress (0..1) ends the work.
+        """Move (N, 3) points to the surface; an exception raised by on_progress (0..1, at the end 1) ends the work.
 
         Numbers of other types become float64. Raises TooFewPoints below MIN_POINTS finite rows, InvalidCloud.
         """
@@ -200,6 +200,8 @@ class Filter:
         for patch in run.patches():
             if on_progress is not None:
                 on_progress(patch.progress)
+        if on_progress is not None:
+            on_progress(1.0)
         return run.result(time.monotonic() - began)
 
     def patches(self, xyz: npt.ArrayLike, options: DenoiseOptions | None = None) -> Iterator[FinishedPatch]:
@@ -228,7 +230,7 @@ class Run:
         if self.apart:
             self.rows = self.rows[~apart]
             self._take()
-        self.iterations = 0
+        self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held = np.zeros(len(self.moved), dtype=bool)
         self.readings: list[Reading] = []  # before each pass, and after the last
@@ -318,7 +320,7 @@ class Run:
         return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
 
     def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
-        done_before, share = self.iterations - 1, 1 / (self.iterations - 1 + left)
+        begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all
         shown = self.readings[-1]
         settled, whole = 0, len(shown.parts) * len(here)
         steps = [np.zeros_like(here) for _ in shown.parts[1:]]  # all but the last, which is settled as it comes
@@ -340,8 +342,8 @@ class Run:
                 indices = self.rows[copies]
                 moved = self.moved[self.points.inverse[copies]]
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
-                progress = (done_before + settled / whole) * share
-                yield FinishedPatch(indices, xyz, self.iterations, left == 1, progress)
+                self._progress = begun_at + settled / whole * share
+                yield FinishedPatch(indices, xyz, self.iterations, left == 1, self._progress)
 
     def _made(
         self,

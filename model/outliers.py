@@ -24,6 +24,9 @@ _FAR, _FARTHER_THAN_NEIGHBOURS = 4.5, 5.0
 _NEAR, _NEARER_THAN_NEIGHBOURS, _ROUNDS = 2.0, 2.5, 3
 _NOTICED, _ALONE = 0.001, 20.0  # of the points; where fewer are far, they have to be so far
 _MOST = 0.1  # of the points; where more seem to belong to nothing, the cloud is of another kind
+# What is sparse beside the rest may be a surface all the same: its points are as far apart as their neighbours
+# are, and lie in a sheet or a line with them (their least std beside the next; of points in a volume 0.6).
+_SHEET, _FLAT, _EVEN = 16, 0.35, 2.0
 _PROBES = 48
 _BLOCK = 2**16  # points whose neighbours are held at once
 
@@ -51,9 +54,13 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
     """
     beside_most, beside_neighbours = _distances(xyz, workers)
     apart = (beside_most > _FAR) | (beside_neighbours > _FARTHER_THAN_NEIGHBOURS)
+    sparse = apart & (beside_neighbours < _EVEN)
+    sheet = np.zeros_like(apart)
+    sheet[sparse] = _on_a_sheet(xyz, xyz[sparse], workers)
+    apart &= ~sheet
     few = apart.mean() < _NOTICED
     if few:
-        apart = beside_most > _ALONE
+        apart = (beside_most > _ALONE) & ~sheet
     if not apart.any():
         return apart
     if apart.mean() > _MOST or _is_scene(xyz[~apart]):
@@ -61,7 +68,7 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
     for _ in range(0 if few else _ROUNDS):
         rows = np.flatnonzero(~apart)
         beside_most, beside_neighbours = _distances(xyz[rows], workers)
-        found = (beside_most > _NEAR) | (beside_neighbours > _NEARER_THAN_NEIGHBOURS)
+        found = ((beside_most > _NEAR) | (beside_neighbours > _NEARER_THAN_NEIGHBOURS)) & ~sheet[rows]
         if not found.any() or apart.sum() + found.sum() > _MOST * len(xyz):
             break
         apart[rows[found]] = True
@@ -82,6 +89,18 @@ def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[
         some = slice(start, start + _BLOCK)
         of_neighbours[some] = np.median(reach[around[some]], axis=1)
     return reach / max(np.quantile(reach, _DENSE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
+
+
+def _on_a_sheet(xyz: npt.NDArray[np.float64], some: npt.NDArray[np.float64], workers: int) -> npt.NDArray[np.bool_]:
+    """Say of some points (M, 3) of a cloud (N, 3) whether those nearest to each lie in a sheet or a line: (M,)."""
+    flat = np.empty(len(some), dtype=bool)
+    tree, count = cKDTree(xyz), min(_SHEET, len(xyz))
+    for start in range(0, len(some), _BLOCK):
+        near = xyz[tree.query(some[start : start + _BLOCK], k=np.arange(1, count + 1), workers=workers)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        least, following, _ = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near).T
+        flat[start : start + _BLOCK] = least < _FLAT**2 * following
+    return flat
 
 
 def _is_scene(xyz: npt.NDArray[np.float64]) -> bool:

@@ -30,7 +30,8 @@ class Client:
     url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
     api_key: sent as a bearer token.
     timeout: seconds of silence that are borne, None for any; of streams (events, patches, progress) at least 60.
-    max_retries: of a busy server and of a broken connection; every other error is raised at once.
+    max_retries: of a busy server and of a broken connection; every other error is raised at once. A server that has
+    answered and is gone (it is restarted) is asked on for `timeout` seconds, but by what uploads a file; 0: never.
     """
 
     def __init__(

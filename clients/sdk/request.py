@@ -152,16 +152,17 @@ def job_call(id: str, *, wait: float = 0.0) -> Call:
 
 def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
     """Build the request for one page of jobs; raises InvalidRequest."""
+    states = list(states)  # which may be an iterator
     if unknown := set(states) - set(STATES):
         raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
     if not 1 <= limit <= MAX_PAGE_SIZE:
         raise InvalidRequest(f"page_size is {limit}; it must be in 1..{MAX_PAGE_SIZE}")
     params: dict[str, str | list[str]] = {"limit": str(limit)}
     if states:
-        params["state"] = list(states)
+        params["state"] = states
     if cursor is not None:
         params["cursor"] = cursor
-    fields = {"states": list(states), "limit": limit, "cursor": cursor}
+    fields = {"states": states, "limit": limit, "cursor": cursor}
     return Call(method="GET", path="/jobs", rpc="ListJobs", fields=fields, params=params)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Iterator
@@ -13,7 +14,7 @@ from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure, next_delay
-from straightpcf.points.errors import InvalidOptions, InvalidRequest
+from straightpcf.points.errors import ConnectionFailed, InvalidOptions, InvalidRequest
 
 __all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async"]
 
@@ -63,12 +64,17 @@ def _is_grpc(url: str) -> bool:
 
 
 class Attempts:
-    """Count the attempts of one request, anew whenever one of them got on; `failure` is what the last one met."""
+    """Count the attempts of one request, anew whenever one of them got on; `failure` is what the last one met.
 
-    def __init__(self, call: Call, receiver: Receiver, max_retries: int) -> None:
+    patience: so many seconds are tried a request that uploads nothing, however often the server is not to be reached.
+    """
+
+    def __init__(self, call: Call, receiver: Receiver, max_retries: int, patience: float = 0.0) -> None:
         self._receiver = receiver
         self._max_retries = 0 if call.once else max_retries
+        self._patience = patience if call.body is None else 0.0
         self._attempt, self._furthest = 0, receiver.furthest
+        self._since = math.nan
         self.failure: Failure | None = None
 
     def delay(self) -> float:
@@ -76,18 +82,33 @@ class Attempts:
         assert self.failure is not None
         if self._receiver.furthest > self._furthest:
             self._attempt, self._furthest = 0, self._receiver.furthest
-        delay = next_delay(self.failure, attempt=self._attempt, max_retries=self._max_retries)
+        if self._attempt == 0:
+            self._since = time.monotonic()
+        most = self._max_retries
+        if isinstance(self.failure.error, ConnectionFailed) and time.monotonic() - self._since < self._patience:
+            most = most and max(most, self._attempt + 1)
+        delay = next_delay(self.failure, attempt=self._attempt, max_retries=most)
         if delay is None:
             raise self.failure.error from self.failure.cause
         self._attempt += 1
         return delay
 
 
-class Transport(ABC):
-    """Run flows in ordinary code; timeout: seconds of silence to bear, None for any."""
+class _Patience:
+    """Know how long to go on asking: a server that answered once is restarted, not missing, when it is gone."""
 
     timeout: float | None
     max_retries: int
+    _has_answered = False
+
+    def attempts(self, step: Step) -> Attempts:
+        """Begin to count the attempts of one request."""
+        patience = math.inf if self.timeout is None else self.timeout
+        return Attempts(*step, self.max_retries, patience if self._has_answered else 0.0)
+
+
+class Transport(_Patience, ABC):
+    """Run flows in ordinary code; timeout: seconds of silence to bear, None for any."""
 
     @abstractmethod
     def close(self) -> None:
@@ -114,19 +135,17 @@ class Transport(ABC):
 
     def stream(self, step: Step) -> Iterator[None]:
         """Make one request until its receiver has it all, and yield whenever something came; raises its error."""
-        attempts = Attempts(*step, self.max_retries)
+        attempts = self.attempts(step)
         while True:
             yield from self.attempt(*step, attempts)
             if attempts.failure is None:
+                self._has_answered = True
                 return
             time.sleep(attempts.delay())
 
 
-class AsyncTransport(ABC):
+class AsyncTransport(_Patience, ABC):
     """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
-
-    timeout: float | None
-    max_retries: int
 
     @abstractmethod
     async def close(self) -> None:
@@ -153,10 +172,11 @@ class AsyncTransport(ABC):
 
     async def stream(self, step: Step) -> AsyncIterator[None]:
         """Do as `Transport.stream`."""
-        attempts = Attempts(*step, self.max_retries)
+        attempts = self.attempts(step)
         while True:
             async for _ in self.attempt(*step, attempts):
                 yield
             if attempts.failure is None:
+                self._has_answered = True
                 return
             await asyncio.sleep(attempts.delay())

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
-from urllib.parse import unquote
+from urllib.parse import quote, unquote
 
 from python_multipart.multipart import parse_options_header
 
-__all__ = ["disposition_name"]
+__all__ = ["disposition", "disposition_name"]
 
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _EXTENDED = re.compile(r";\s*filename\*\s*=\s*(UTF-8|ISO-8859-1)'[\w-]*'([\w!#$&+.^`|~%-]+)", re.ASCII | re.IGNORECASE)
+
+
+def disposition(name: str) -> str:
+    """Return a header that calls a file to be saved by any name, as ASCII."""
+    return f"attachment; filename*=utf-8''{quote(name, safe='')}"
 
 
 def disposition_name(header: str) -> str | None:

@@ -17,6 +17,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from straightpcf.points.errors import JobExpired, RangeNotSatisfiable
+from straightpcf.service.api.disposition import disposition
 from straightpcf.service.api.errors import problem_response
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord
@@ -50,7 +51,7 @@ def result_response(
         if _matches(request.headers.get("if-none-match"), headers["ETag"]):
             file.close()
             return Response(status_code=304, headers={"ETag": headers["ETag"]}, background=after)
-        asked = _ranges(request, headers["ETag"])
+        asked = _ranges(request, headers["ETag"]) if request.method == "GET" else []  # RFC 9110, 14.2
         parts = [f"{first}-{last}" for first, last in asked if (int(first) < size if first else int(last) > 0)]
         if asked and not parts:
             file.close()
@@ -83,6 +84,7 @@ def result_headers(record: JobRecord) -> dict[str, str]:
     return {
         "ETag": f'"{record.result.sha256}"',
         "Repr-Digest": f"sha-256=:{digest}:",
+        "Cache-Control": "private, no-cache",  # an id may be used again once its job is deleted
         "X-Job-Id": record.id,
         "X-Points": str(report["points"]),
         "X-Iterations": str(report["iterations"]),
@@ -96,9 +98,18 @@ def report_and_file(file: IO[bytes], record: JobRecord, *, after: BackgroundTask
     """Send the report as JSON and then the file, as multipart/mixed (RFC 2046)."""
     assert record.result is not None
     result, boundary = record.result, f"straightpcf-{secrets.token_hex(12)}"
+    headers = result_headers(record)
+    headers.pop("ETag")  # what tells the file from others does not tell this answer
+    of_file = {
+        "Content-Type": result.media_type,
+        "Content-Length": str(result.bytes),
+        "Content-Disposition": disposition(result.filename),
+        "Repr-Digest": headers.pop("Repr-Digest"),
+    }
+    described = "".join(f"{name}: {value}\r\n" for name, value in of_file.items())
     head = (
         f"--{boundary}\r\nContent-Type: application/json\r\n\r\n{json.dumps(record.report)}\r\n"
-        f"--{boundary}\r\nContent-Type: {result.media_type}\r\nContent-Length: {result.bytes}\r\n\r\n"
+        f"--{boundary}\r\n{described}\r\n"
     ).encode()
     tail = f"\r\n--{boundary}--\r\n".encode()
 
@@ -109,7 +120,7 @@ def report_and_file(file: IO[bytes], record: JobRecord, *, after: BackgroundTask
                 yield chunk
         yield tail
 
-    headers = {**result_headers(record), "Content-Length": str(len(head) + result.bytes + len(tail))}
+    headers["Content-Length"] = str(len(head) + result.bytes + len(tail))
     return StreamingResponse(
         body(), media_type=f"multipart/mixed; boundary={boundary}", headers=headers, background=after
     )

@@ -224,6 +224,24 @@ def test_a_connection_that_breaks_is_tried_again(monkeypatch: pytest.MonkeyPatch
         assert len(heads) == 2
 
 
+def test_a_server_that_answered_and_is_gone_is_asked_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    broken = [b""] * 5
+    with answering(HEALTHY, *broken, HEALTHY) as (url, heads), Client(url, max_retries=1) as client:
+        assert client.health().ready
+        assert client.health().ready
+        assert len(heads) == 7
+    for timeout, max_retries, most in ((0.02, 1, 4), (60.0, 0, 2)):
+        with (
+            answering(HEALTHY, *broken, HEALTHY) as (url, heads),
+            Client(url, timeout=timeout, max_retries=max_retries) as client,
+        ):
+            assert client.health().ready
+            with pytest.raises(ConnectionFailed):
+                client.health()
+            assert 2 <= len(heads) <= most
+
+
 def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:
     with answering(BUSY, BUSY) as (url, _), Client(url, max_retries=1) as client, pytest.raises(ServerBusy):
         client.health()

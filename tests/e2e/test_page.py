@@ -118,6 +118,63 @@ def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     assert "canceled" in page.inner_text("#note")
 
 
+def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, scan: Path, tmp_path: Path) -> None:
+    np.save(other := tmp_path / "other.npy", 3 + noisy(sphere(POINTS), 0.01))  # as many points, elsewhere
+    page.select_option("#iterations", "1")
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.set_input_files("#file", other)  # while the first one runs
+    page.wait_for_selector("#report:not([hidden])")
+    page.click("#submit")
+    page.wait_for_selector("#report", state="hidden")
+    page.wait_for_selector("#report:not([hidden])")
+    assert float(page.inner_text("#legend-top").split()[0].replace(",", "")) < 0.5
+
+
+def test_deleting_what_is_shown_takes_it_away_and_keeps_the_focus(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    for _ in range(2):
+        page.click("#submit")
+        page.wait_for_selector("#cancel:not([hidden])")
+        page.wait_for_selector("#cancel", state="hidden")
+    assert page.is_visible("#report")
+    page.locator("#jobs-list li").nth(1).wait_for()
+    page.locator("#jobs-list li").nth(0).get_by_text("Delete").click()
+    page.wait_for_selector("#report", state="hidden")
+    wait_for(lambda: page.locator("#jobs-list li").count() == 1)
+    assert page.is_hidden("#error")
+    assert "deleted" in page.inner_text("#note")
+    wait_for(lambda: page.evaluate("document.activeElement.closest('#jobs-list') !== null"))
+
+
+def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, tmp_path: Path) -> None:
+    np.save(large := tmp_path / "large.npy", noisy(sphere(40_000), 0.01))
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    held: list[Any] = []
+    page.route("**/jobs?*filename=large*", held.append)
+    page.set_input_files("#file", large)
+    page.click("#submit")
+    wait_for(lambda: bool(page.wait_for_timeout(50) or held))
+    page.locator("#jobs-list li").get_by_text("Show").click()
+    assert "being sent" in page.inner_text("#error")
+    held[0].continue_()
+    page.wait_for_selector("#status:has-text('Pass')")
+    page.click("#cancel")
+    page.wait_for_selector("#cancel", state="hidden")
+
+
+def test_a_key_is_kept_through_a_reload(page: Any) -> None:
+    page.evaluate("sessionStorage.setItem('straightpcf.key', 'secret')")
+    page.reload()
+    page.wait_for_selector("#server:has-text('version')")
+    assert page.input_value("#key") == "secret"
+    assert page.is_visible("#key")
+
+
 def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
     read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
     for case, raw in TABLES.items():

@@ -202,6 +202,19 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
     assert len(seen) == 3
 
 
+@pytest.mark.parametrize(("iterations", "passes_left"), [(3, None), ("auto", [2, 2, 0]), ("auto", [2, 2, 2, 1, 0])])
+def test_progress_never_falls_and_ends_at_one(
+    tiny: Filter, monkeypatch: pytest.MonkeyPatch, iterations: Any, passes_left: list[int] | None
+) -> None:
+    if passes_left is not None:
+        foreseen = iter(passes_left)
+        monkeypatch.setattr(type(tiny.calibration), "passes_left", lambda *_: next(foreseen))
+    seen: list[float] = []
+    tiny.denoise(noisy(torus(5000), 0.01), DenoiseOptions(iterations=iterations), on_progress=seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
 @pytest.mark.parametrize(("far", "zooms"), [(0.0, 1), (100.0, 0)])  # an object; beside far points: a scene
 def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
     shipped: Filter, monkeypatch: pytest.MonkeyPatch, far: float, zooms: int

@@ -8,7 +8,7 @@ import pytest
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.outliers import isolated
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import distance_to_torus, noisy, torus
+from tests.clouds import distance_to_torus, noisy, sphere, torus
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +42,17 @@ def test_no_point_of_a_noisy_cloud_is_taken_for_alone(noise_std: float) -> None:
     assert not isolated(noisy(torus(5000), noise_std)).any()
     heavy = np.random.default_rng(1).laplace(scale=noise_std or 1e-6, size=(5000, 3))
     assert not isolated(torus(5000) + heavy).any()
+
+
+def test_a_sparse_surface_beside_a_dense_one_belongs_to_the_cloud() -> None:
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-1, 1, (900, 2)), 0.01 * rng.standard_normal(900)])
+    ball = noisy(0.15 * sphere(10_000), 0.002) + np.array([0, 0, 0.25])
+    assert not isolated(np.vstack([ball, table])).any()
+    air = rng.uniform(-1, 1, (900, 3)) + np.array([0, 0, 2])
+    apart = isolated(np.vstack([ball, air]))
+    assert not apart[:10_000].any()
+    assert apart[10_000:].mean() > 0.8
 
 
 def test_one_point_far_away_does_not_make_an_object_a_scene() -> None:

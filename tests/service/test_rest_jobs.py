@@ -198,14 +198,20 @@ def test_denoise_tells_its_events_and_its_report_on_the_same_response(http: http
     with http.stream("POST", "/denoise?iterations=1", content=SMALL, headers={"Accept": "text/event-stream"}) as answer:
         events = sse(answer.iter_lines())
     assert events[-1]["data"]["state"] == "succeeded"
-    plain = http.get(events[-1]["data"]["links"]["result"]).content
+    plain = http.get(events[-1]["data"]["links"]["result"])
+    assert "no-cache" in plain.headers["cache-control"]
     both = http.post("/denoise?iterations=1&report=true", content=SMALL)
     assert both.headers["content-type"].startswith("multipart/mixed")
     boundary = both.headers["content-type"].partition("boundary=")[2].encode()
     _, report, cloud, end = both.content.split(b"--" + boundary)
     assert json.loads(report.partition(b"\r\n\r\n")[2])["points"] == 300
-    assert cloud.partition(b"\r\n\r\n")[2][:-2] == plain
+    described, _, file = cloud.partition(b"\r\n\r\n")
+    assert file[:-2] == plain.content
     assert end == b"--\r\n"
+    # What tells the file from others is said of the file, not of an answer that has more in it.
+    assert f"Repr-Digest: {plain.headers['repr-digest']}".encode() in described
+    assert b"Content-Disposition: attachment; filename*=utf-8''" in described
+    assert not {"repr-digest", "etag"} & set(both.headers)
 
 
 def test_cancel_frees_the_worker_within_a_second(http: httpx2.Client) -> None:

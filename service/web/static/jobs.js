@@ -17,19 +17,42 @@ export function rememberJob(id) {
 }
 
 // Fill `list`, and show `section` if there is anything in it.
-export async function showJobs({ section, list, onShow, onProblem }) {
+export async function showJobs({ section, list, ...hooks }) {
   if (known().length === 0) {
     section.hidden = true;
     return;
   }
-  const { jobs } = await json(`jobs?limit=${ASKED}`);
-  const ours = jobs.filter((job) => known().includes(job.id));
+  const ours = await found();
   section.hidden = ours.length === 0;
-  const again = () => showJobs({ section, list, onShow, onProblem });
-  list.replaceChildren(...ours.map((job) => row(job, { again, onShow, onProblem })));
+  const again = () => showJobs({ section, list, ...hooks });
+  const rows = ours.map((job) => row(job, { again, ...hooks }));
+  const focused = list.contains(document.activeElement) ? document.activeElement : null;
+  const place = [...list.children].findIndex((item) => item.contains(focused));
+  list.replaceChildren(...rows);
+  if (focused) focusAgain(list, focused.getAttribute("aria-label"), place);
 }
 
-function row(job, { again, onShow, onProblem }) {
+// Return this tab's jobs that there still are, the newest first, also those that many others came after.
+async function found() {
+  const { jobs, next_cursor: more } = await json(`jobs?limit=${ASKED}`);
+  const listed = new Map(jobs.map((job) => [job.id, job]));
+  const others = known().filter((id) => more && !listed.has(id));
+  const older = await Promise.allSettled(others.map((id) => json(`jobs/${encodeURIComponent(id)}`)));
+  for (const { status, value, reason } of older) {
+    if (status === "fulfilled") listed.set(value.id, value);
+    else if (reason.status !== 404) throw reason;
+  }
+  return known().flatMap((id) => listed.get(id) ?? []);
+}
+
+// Where the focus was in a list that is new: on the same button, else in the same place.
+function focusAgain(list, label, place) {
+  const same = [...list.querySelectorAll("[aria-label]")].find((button) => button.getAttribute("aria-label") === label);
+  const row = list.children[place] ?? list.lastElementChild;
+  (same ?? row?.querySelector("button") ?? document.getElementById("file")).focus();
+}
+
+function row(job, { again, onShow, onDeleted, onProblem }) {
   const item = document.createElement("li");
   const name = job.name ?? job.id;
   const size = job.points === null ? text.bytes(job.bytes) : text.plural(job.points, "point");
@@ -47,6 +70,7 @@ function row(job, { again, onShow, onProblem }) {
   }
   add("Delete", {}, async () => {
     await call(`jobs/${encodeURIComponent(job.id)}`, { method: "DELETE" });
+    onDeleted(job);
     await again();
   });
   item.append(element("span", name, { class: "name" }), element("span", `${SAID[job.state] ?? job.state} · ${size}`, { class: "quiet" }), actions);

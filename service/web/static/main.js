@@ -1,6 +1,6 @@
 // The page: a file and options go out as a job; its words, points and result come back.
 
-import { Problem, call, json, keepApiKey, upload } from "./api.js";
+import { Problem, apiKey, call, json, keepApiKey, upload } from "./api.js";
 import { Cloud } from "./cloud.js";
 import { followJob, thinning } from "./follow.js";
 import { Form } from "./form.js";
@@ -15,8 +15,9 @@ const parts = Object.fromEntries([...document.querySelectorAll("[id]")].map((par
 const stage = new Stage(parts);
 const form = new Form(parts, chosen);
 const files = new Map(); // the file of each job that was sent since the page was loaded
-let reading = Promise.resolve(null); // {count, stride, xyz} of the chosen file, or null
-let run = null; // {id, abort} while a job is sent or followed
+let latest = { file: null, reading: null }; // the file that was read last, and the promise of what is in it
+let run = null; // {id, abort} while a job is sent or followed; id is null until the server has the file
+let shown = null; // the id of the job whose result is shown
 
 parts.form.addEventListener("submit", (event) => {
   event.preventDefault();
@@ -29,6 +30,8 @@ parts.key.addEventListener("change", () => {
   begin();
 });
 parts["jobs-refresh"].addEventListener("click", listJobs);
+parts.key.value = apiKey(); // a reload keeps it
+parts["key-row"].hidden = !apiKey();
 begin();
 
 function begin() {
@@ -39,10 +42,15 @@ function begin() {
 function chosen(file) {
   parts.error.hidden = true;
   if (run) return; // what is on the stage is the running job's
-  reading = read(file);
-  reading.then((before) => {
+  latest = { file: null, reading: null }; // the same file may have changed
+  readingOf(file).then((before) => {
     if (form.file === file && !run) showBefore(file, before);
   });
+}
+
+function readingOf(file) {
+  if (latest.file !== file) latest = { file, reading: read(file) };
+  return latest.reading;
 }
 
 // Return {count, stride, xyz, fault}, or {fault} where the page cannot read the file.
@@ -59,7 +67,8 @@ async function read(file) {
 }
 
 function showBefore(file, before) {
-  parts.report.hidden = parts.progress.hidden = true;
+  hideResult();
+  parts.progress.hidden = true;
   if (!before.xyz || before.count === 0) {
     stage.show(null, before.fault ?? `${file.name} has no points.`);
     return;
@@ -89,18 +98,18 @@ async function send() {
     files.set(job.id, file);
     rememberJob(job.id);
     listJobs();
-    await follow(job.id, await reading, abort.signal);
+    await follow(job.id, await readingOf(file), abort.signal);
   } catch (error) {
     if (run === mine) parts.progress.hidden = true;
     if (!abort.signal.aborted) throw error;
-    if (run === mine) speak("Canceled");
+    if (run === mine && mine.id === null) speak("Canceled");
   } finally {
     done(mine);
   }
 }
 
 async function follow(id, before, signal) {
-  parts.report.hidden = true;
+  hideResult();
   let note = before?.xyz ? "" : before?.fault ?? "";
   if (!before?.xyz) stage.show(null, note);
   const hooks = {
@@ -116,6 +125,7 @@ async function follow(id, before, signal) {
     showReport(job, parts);
     offerDownload(parts.download, job, showProblem);
     parts.report.hidden = false;
+    shown = id;
     parts["report-title"].focus({ preventScroll: true });
   } else {
     parts.progress.hidden = true;
@@ -130,8 +140,17 @@ async function follow(id, before, signal) {
   }
 }
 
-// Follow a job of the list; one that runs here is left to run on the server.
+function hideResult() {
+  parts.report.hidden = true;
+  shown = null;
+}
+
+// Follow a job of the list; one that runs here is left to run on the server, but a file that is still sent is not lost.
 async function showJob(job) {
+  if (run && run.id === null) {
+    showProblem(new Problem({ code: "", detail: "A file is being sent. Wait until it is there, or cancel it." }));
+    return;
+  }
   run?.abort.abort();
   parts.error.hidden = true;
   const abort = new AbortController();
@@ -139,9 +158,9 @@ async function showJob(job) {
   busy(true);
   try {
     const file = files.get(job.id);
-    reading = file ? read(file) : Promise.resolve({ fault: "" });
-    await follow(job.id, await reading, abort.signal);
+    await follow(job.id, file ? await readingOf(file) : { fault: "" }, abort.signal);
   } catch (error) {
+    if (run === mine) parts.progress.hidden = true;
     if (!abort.signal.aborted) throw error;
   } finally {
     done(mine);
@@ -162,8 +181,19 @@ async function cancel() {
   else await call(`jobs/${encodeURIComponent(run.id)}/cancel`, { method: "POST" });
 }
 
+// A job of the list was deleted here: nothing of it is left to follow or to download.
+function deleted(job) {
+  files.delete(job.id);
+  if (run?.id === job.id) run.abort.abort();
+  if (shown === job.id) hideResult();
+  else if (run?.id !== job.id) return;
+  speak("Deleted");
+  stage.note("The job was deleted.");
+}
+
 function listJobs() {
-  showJobs({ section: parts.jobs, list: parts["jobs-list"], onShow: showJob, onProblem: showProblem }).catch(showProblem);
+  const hooks = { onShow: showJob, onDeleted: deleted, onProblem: showProblem };
+  showJobs({ section: parts.jobs, list: parts["jobs-list"], ...hooks }).catch(showProblem);
 }
 
 function showEvent(kind, data) {
