@@ -26,7 +26,7 @@ _NOTICED, _ALONE = 0.001, 20.0  # of the points; where fewer are far, they have 
 _MOST = 0.1  # of the points; where more seem to belong to nothing, the cloud is of another kind
 # What is sparse beside the rest may be a surface all the same: its points are as far apart as their neighbours
 # are, and lie in a sheet or a line with them (their least std beside the next; of points in a volume 0.6).
-_SHEET, _FLAT, _EVEN = 16, 0.35, 2.0
+_SHEET, _FLAT, _MOSTLY, _EVEN = 16, 0.35, 0.5, 2.0
 _PROBES = 48
 _BLOCK = 2**16  # points whose neighbours are held at once
 
@@ -54,9 +54,7 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
     """
     beside_most, beside_neighbours = _distances(xyz, workers)
     apart = (beside_most > _FAR) | (beside_neighbours > _FARTHER_THAN_NEIGHBOURS)
-    sparse = apart & (beside_neighbours < _EVEN)
-    sheet = np.zeros_like(apart)
-    sheet[sparse] = _on_a_sheet(xyz, xyz[sparse], workers)
+    sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _EVEN), workers)
     apart &= ~sheet
     few = apart.mean() < _NOTICED
     if few:
@@ -91,16 +89,24 @@ def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[
     return reach / max(np.quantile(reach, _DENSE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
 
 
-def _on_a_sheet(xyz: npt.NDArray[np.float64], some: npt.NDArray[np.float64], workers: int) -> npt.NDArray[np.bool_]:
-    """Say of some points (M, 3) of a cloud (N, 3) whether those nearest to each lie in a sheet or a line: (M,)."""
-    flat = np.empty(len(some), dtype=bool)
-    tree, count = cKDTree(xyz), min(_SHEET, len(xyz))
-    for start in range(0, len(some), _BLOCK):
-        near = xyz[tree.query(some[start : start + _BLOCK], k=np.arange(1, count + 1), workers=workers)[1]]
+def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], workers: int) -> npt.NDArray[np.bool_]:
+    """Say of each point of a cloud (N, 3) that is `asked` about, (N,), whether it is part of a sheet or a line: (N,).
+
+    Those nearest to it lie in one, and so do those nearest to most of them: a few points lie flat by chance.
+    """
+    flat = np.zeros(len(xyz), dtype=bool)
+    rows, tree = np.flatnonzero(asked), cKDTree(xyz)
+    around = np.empty((len(rows), min(_SHEET, len(xyz))), dtype=np.int32)
+    for start in range(0, len(rows), _BLOCK):
+        some = slice(start, start + _BLOCK)
+        around[some] = tree.query(xyz[rows[some]], k=np.arange(1, around.shape[1] + 1), workers=workers)[1]
+        near = xyz[around[some]]
         near -= near.mean(axis=1, keepdims=True)
         least, following, _ = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near).T
-        flat[start : start + _BLOCK] = least < _FLAT**2 * following
-    return flat
+        flat[rows[some]] = least < _FLAT**2 * following
+    sheet = np.zeros(len(xyz), dtype=bool)
+    sheet[rows] = flat[around].mean(axis=1) > _MOSTLY
+    return sheet
 
 
 def _is_scene(xyz: npt.NDArray[np.float64]) -> bool:

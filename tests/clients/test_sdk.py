@@ -18,9 +18,12 @@ import numpy as np
 import pytest
 
 from straightpcf.clients import sdk
-from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, retry
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, retry, transport
 from straightpcf.clients.sdk.aio import AsyncJobs
 from straightpcf.clients.sdk.client import Jobs
+from straightpcf.clients.sdk.receive import Body
+from straightpcf.clients.sdk.request import Call
+from straightpcf.clients.sdk.transport import Attempts
 from straightpcf.points.errors import (
     ConnectionFailed,
     InternalError,
@@ -231,15 +234,26 @@ def test_a_server_that_answered_and_is_gone_is_asked_on(monkeypatch: pytest.Monk
         assert client.health().ready
         assert client.health().ready
         assert len(heads) == 7
-    for timeout, max_retries, most in ((0.02, 1, 4), (60.0, 0, 2)):
-        with (
-            answering(HEALTHY, *broken, HEALTHY) as (url, heads),
-            Client(url, timeout=timeout, max_retries=max_retries) as client,
-        ):
-            assert client.health().ready
-            with pytest.raises(ConnectionFailed):
-                client.health()
-            assert 2 <= len(heads) <= most
+    with answering(HEALTHY, b"") as (url, heads), Client(url, max_retries=0) as client:
+        assert client.health().ready
+        with pytest.raises(ConnectionFailed):
+            client.health()
+        assert len(heads) == 2
+
+
+def test_it_is_asked_for_no_longer_than_silence_is_borne_and_uploads_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = iter(range(0, 1000, 4))
+    monkeypatch.setattr(transport, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    for body, most in ((None, 14), (b"cloud", 1)):
+        call = Call(method="PUT", path="/", rpc="", body=body)
+        attempts = Attempts(call, Body(), max_retries=1, patience=60.0)
+        attempts.failure = retry.Failure(error=ConnectionFailed("refused"), retryable=True)
+        for _ in range(most):
+            assert attempts.delay() > 0
+        with pytest.raises(ConnectionFailed):
+            attempts.delay()
 
 
 def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:

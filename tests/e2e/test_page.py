@@ -155,7 +155,7 @@ def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, t
     page.click("#submit")
     page.wait_for_selector("#report:not([hidden])")
     held: list[Any] = []
-    page.route("**/jobs?*filename=large*", held.append)
+    page.route("**/jobs?*filename=large*", lambda route: held.append(route))
     page.set_input_files("#file", large)
     page.click("#submit")
     wait_for(lambda: bool(page.wait_for_timeout(50) or held))
