@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
 import uuid
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -219,19 +220,23 @@ def check_suffix(target: Path, format: str) -> None:
 
 
 def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
-    if isinstance(source, str | Path):
+    if isinstance(source, str | os.PathLike):
         path = Path(source)
         if not path.is_file():  # a pipe has no size to declare, and cannot be sent again
             raise FileNotFoundError(f"{path} is no file")
         return path.name, path
     if isinstance(source, bytes | bytearray | memoryview):
         return None, bytes(source)
+    if hasattr(source, "read"):
+        raise InvalidRequest("a source is a path, bytes, an array or an open3d cloud; of an open file, give its bytes")
     return "cloud.npy", _npy(np.asarray(getattr(source, "points", source)))
 
 
 def _npy(xyz: npt.NDArray[Any]) -> bytes:
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind != "f":
-        raise InvalidCloud(f"an array of points must be (N, 3) floating point, got {xyz.shape} {xyz.dtype}")
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
+        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {xyz.shape} {xyz.dtype}")
+    if xyz.dtype.kind != "f":
+        xyz = xyz.astype(np.float64)
     buffer = io.BytesIO()
     np.save(buffer, xyz, allow_pickle=False)
     return buffer.getvalue()

@@ -14,6 +14,7 @@ from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import open_result, result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
 from straightpcf.service.api.intake import take_job
+from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.openapi import (
     EVENTS_PARAMETERS,
     EVENTS_RESPONSES,
@@ -167,4 +168,4 @@ async def job_stream(id: str, request: Request, owner: Owner) -> Response:
     accept = request.headers.get("accept", "*/*")
     if len(accept) > 1000:
         raise InvalidRequest(f"Accept has {len(accept)} characters")
-    return patch_stream(engine, id, owner, as_json=NDJSON_MEDIA_TYPE in accept)
+    return patch_stream(engine, id, owner, as_json=asks_for(accept, NDJSON_MEDIA_TYPE))

@@ -17,6 +17,7 @@ from straightpcf.service.api.download import open_result, report_and_file, resul
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
 from straightpcf.service.api.intake import flag, take_job
 from straightpcf.service.api.jobs import job_response
+from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.openapi import (
     DENOISE_BODY,
     DENOISE_FORM_BODY,
@@ -67,7 +68,7 @@ async def denoise(request: Request, owner: Owner) -> Response:
     engine: Engine = request.app.state.engine
     prefer = parse_prefer(request.headers.getlist("prefer"))
     record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
-    if SSE_MEDIA_TYPE in request.headers.get("accept", ""):
+    if asks_for(request.headers.get("accept", ""), SSE_MEDIA_TYPE):
         return event_stream(engine, record.id, owner, headers={"Location": f"/jobs/{record.id}"})
     if prefer.respond_async and prefer.wait is None:
         return job_response(record, 202, prefer.applied(finished=False))

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
 from straightpcf.points.errors import NotFound
+from straightpcf.service.api.negotiate import asks_for
 
 __all__ = ["ASSET_PREFIX", "install_page"]
 
@@ -78,7 +79,7 @@ def _asset(path: Path) -> Asset:
 
 def _response(request: Request, asset: Asset) -> Response:
     """Send an asset, packed for whom it suits, or 304 to who has it."""
-    is_packed = _takes_gzip(",".join(request.headers.getlist("accept-encoding")))
+    is_packed = asks_for(",".join(request.headers.getlist("accept-encoding")), "gzip")
     # A packed body is another representation: it needs a tag of its own.
     headers = {**_HEADERS, "ETag": f'"{asset.etag}{"-gz" if is_packed else ""}"'}
     if asset.etag in request.headers.get("if-none-match", ""):
@@ -86,12 +87,3 @@ def _response(request: Request, asset: Asset) -> Response:
     if is_packed:
         headers["Content-Encoding"] = "gzip"
     return Response(asset.packed if is_packed else asset.body, media_type=asset.media_type, headers=headers)
-
-
-def _takes_gzip(accepted: str) -> bool:
-    """Read an Accept-Encoding header; `gzip;q=0` refuses it (RFC 9110, 12.4.2)."""
-    for item in accepted.lower().replace(" ", "").split(","):
-        coding, _, weight = item.partition(";q=")
-        if coding == "gzip":
-            return not weight or weight.strip("0.") != ""
-    return False

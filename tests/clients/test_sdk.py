@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import socket
 import subprocess
 import sys
@@ -149,6 +150,20 @@ def test_what_can_be_known_here_is_refused_before_anything_is_sent() -> None:
             client.denoise(sphere(100).T)
         with pytest.raises(FileNotFoundError):
             client.denoise("no-such-file.ply")
+        with pytest.raises(InvalidRequest, match="give its bytes"):
+            client.denoise(io.BytesIO(b"x"))
+
+
+def test_whole_numbers_and_any_path_are_taken(client: Client, tmp_path: Path) -> None:
+    whole = np.round(100 * sphere(POINTS)).astype(np.int32)
+    np.save(path := tmp_path / "whole.npy", whole.astype(np.float64))
+
+    class Somewhere:
+        def __fspath__(self) -> str:
+            return str(path)
+
+    results = [client.denoise(source, iterations=1).xyz for source in (whole, Somewhere())]
+    np.testing.assert_array_equal(*results)
 
 
 def test_a_body_over_the_limit_is_refused_by_its_class(strict_server: RunningServer) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.prefer import parse_prefer
 
 
@@ -22,3 +23,14 @@ from straightpcf.service.api.prefer import parse_prefer
 def test_only_what_was_heeded_is_said_to_be_applied(prefer: str, finished: bool, applied: str | None) -> None:
     said = parse_prefer([prefer]).applied(finished=finished, longest=60)
     assert said.get("Preference-Applied") == applied
+
+
+@pytest.mark.parametrize(
+    ("header", "asked"),
+    [
+        ("text/event-stream", True), ("TEXT/Event-Stream; q=0.5, */*", True), ("*/*, text/event-stream;q=0", False),
+        ("text/event-stream;q=0.000", False), ("text/event-streams", False), ("", False),
+    ],
+)  # fmt: skip
+def test_what_a_client_asks_for_is_read_as_rfc_9110_has_it(header: str, asked: bool) -> None:
+    assert asks_for(header, "text/event-stream") is asked
