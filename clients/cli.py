@@ -107,20 +107,27 @@ def denoise(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Denoise one cloud, in this process or on a server."""
-    from straightpcf.points.formats import format_named, format_wanted
+    from straightpcf.clients.sdk.request import check_suffix
+    from straightpcf.points.formats import format_by_suffix, format_named, format_wanted
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
     name = name or (None if source == STDIO else source.name)
+    suffix = Path(name or "").suffix
     if target != STDIO:
         check_target(target)
     if format is not None:
-        format = format_named(format).name
+        wanted_format = format_named(format)
+        format = wanted_format.name
+        if format_by_suffix(name or "") is not wanted_format:
+            suffix = wanted_format.suffixes[0]
+        if target != STDIO:
+            check_suffix(target, format)
     elif target != STDIO:
         format = format_wanted(target.name, name)
     if url is not None and (device != Device.auto or weights is not None or threads is not None):
         raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
-    with interruptible(), input_file(source, name) as path, output_file(target, Path(name or "").suffix) as out:
+    with interruptible(), input_file(source, name) as path, output_file(target, suffix) as out:
         if url is not None:
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
                 done = client.denoise(

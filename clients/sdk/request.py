@@ -117,8 +117,10 @@ def upload_call(
     name = name or own_name
     if name is None and isinstance(body, bytes):
         recognised(body[:HEAD_BYTES], None)
-    if format is None and target is not None:
+    if target is not None and format is None:
         format = format_wanted(target.name, name)
+    elif target is not None and format is not None:
+        check_suffix(target, format)
     params = {name: str(value) for name, value in asdict(options).items()}
     if name is not None:
         params["filename"] = name

@@ -140,6 +140,12 @@ def test_a_result_is_not_called_what_it_is_not(server: RunningServer, tmp_path: 
     assert b"the result is xyz, and r.ply is a name for ply" in done.stderr
     assert list(tmp_path.iterdir()) == [scan]
     assert cli(server, "result", id, tmp_path / "r.txt").returncode == 0
+    for where in (("--url", server.url), ("--device", "cpu")):
+        done = cli(None, "denoise", scan, tmp_path / "r.ply", "--format", "npy", "--iterations", 1, *where)
+        assert (done.returncode, done.stderr.count(b"\n")) == (3, 1)
+        assert b"the result is npy, and r.ply is a name for ply" in done.stderr
+        piped = cli(None, "denoise", scan, "-", "--format", "npy", "--iterations", 1, *where)
+        assert piped.stdout.startswith(b"\x93NUMPY")
 
 
 @pytest.mark.parametrize("remote", [False, True])
