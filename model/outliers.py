@@ -95,6 +95,8 @@ def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], work
     Those nearest to it lie in one, and so do those nearest to most of them: a few points lie flat by chance.
     """
     flat = np.zeros(len(xyz), dtype=bool)
+    if not asked.any():  # as of nearly every cloud: spare it another tree
+        return flat
     rows, tree = np.flatnonzero(asked), cKDTree(xyz)
     around = np.empty((len(rows), min(_SHEET, len(xyz))), dtype=np.int32)
     for start in range(0, len(rows), _BLOCK):

@@ -85,8 +85,9 @@ class Attempts:
         if self._attempt == 0:
             self._since = time.monotonic()
         most = self._max_retries
-        if isinstance(self.failure.error, ConnectionFailed) and time.monotonic() - self._since < self._patience:
-            most = most and max(most, self._attempt + 1)
+        is_gone = isinstance(self.failure.error, ConnectionFailed)
+        if most and is_gone and time.monotonic() - self._since < self._patience:
+            most = max(most, self._attempt + 1)
         delay = next_delay(self.failure, attempt=self._attempt, max_retries=most)
         if delay is None:
             raise self.failure.error from self.failure.cause

@@ -148,6 +148,17 @@ def test_deleting_what_is_shown_takes_it_away_and_keeps_the_focus(page: Any, sca
     wait_for(lambda: page.evaluate("document.activeElement.closest('#jobs-list') !== null"))
 
 
+def test_ones_jobs_are_listed_however_many_came_after_them(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    page.route("**/jobs?limit=*", lambda route: route.fulfill(json={"jobs": [], "next_cursor": "more"}))
+    page.reload()
+    page.locator("#jobs-list li").get_by_text("Show").wait_for()
+    assert page.locator("#jobs-list li").count() == 1
+
+
 def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, tmp_path: Path) -> None:
     np.save(large := tmp_path / "large.npy", noisy(sphere(40_000), 0.01))
     page.set_input_files("#file", scan)

@@ -184,9 +184,10 @@ async function cancel() {
 // A job of the list was deleted here: nothing of it is left to follow or to download.
 function deleted(job) {
   files.delete(job.id);
-  if (run?.id === job.id) run.abort.abort();
-  if (shown === job.id) hideResult();
-  else if (run?.id !== job.id) return;
+  const isFollowed = run?.id === job.id;
+  if (!isFollowed && shown !== job.id) return;
+  if (isFollowed) run.abort.abort();
+  hideResult();
   speak("Deleted");
   stage.note("The job was deleted.");
 }
