@@ -19,6 +19,7 @@ from straightpcf.model.normals import recompute_normals
 from straightpcf.points.errors import InvalidOptions
 
 __all__ = [
+    "ALONG_BEAMS",
     "AROUND",
     "CANDIDATES",
     "EARLIEST",
@@ -66,6 +67,8 @@ _SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
 OTHER_NOISE = 0.25
 HEAVY_TAILED, TAILS = 0.7, (0.6, 2.0)
 UNEQUAL, STRETCH = 0.4, 0.4
+# Of a cloud that came along beams (`eye`), that share of the patches has noise along them only.
+ALONG_BEAMS = 0.7
 # The noise of clouds that first passes see, in radii of the bounding sphere.
 FIRST_NOISE = 0.03 * (np.arange(60) + 0.5) / 60
 _RADII = 200  # patches of a cloud that are measured
@@ -207,24 +210,29 @@ class PatchSource:
         shapes: list[list[npt.NDArray[np.float32]]],
         normals: Sequence[npt.NDArray[np.float32] | None] | None = None,
         surfaces: Sequence[npt.NDArray[np.float32] | None] | None = None,
+        eyes: Sequence[npt.NDArray[np.float32] | None] | None = None,
     ) -> None:
         """Take the clouds of each shape, in one frame; the one of most points is taken for its surface.
 
         surfaces: another cloud of each shape to be taken for that, (M, 3), or None; normals: those of the clouds that
-        are, (M, 3); None where they are to be computed.
+        are, (M, 3); None where they are to be computed. eyes: the place (3,) that the beams came from which met the
+        points of a shape, or None where there were no beams.
         """
         if not shapes:
             raise InvalidOptions("no training cloud is left after the validation shapes are taken out")
         self.clouds: list[npt.NDArray[np.float64]] = []
         self.surfaces: list[Surface] = []
+        self.eyes: list[npt.NDArray[np.float64] | None] = []
         unknown = [None] * len(shapes)
-        for shape, given, surface in zip(shapes, normals or unknown, surfaces or unknown, strict=True):
+        beside = zip(shapes, normals or unknown, surfaces or unknown, eyes or unknown, strict=True)
+        for shape, given, surface, eye in beside:
             own = Surface.of(shape, given, surface)
             for cloud in shape:
                 wide = cloud.astype(np.float64)
                 frame = CloudFrame.of(wide)
                 self.clouds.append(frame.enter(wide))
                 self.surfaces.append(Surface(frame.enter(own.xyz), own.normals))
+                self.eyes.append(None if eye is None else frame.enter(eye.astype(np.float64)))
         self.passed: PatchMaker | None = None  # draws patches of clouds after passes
         self._trees = [cKDTree(cloud) for cloud in self.clouds]
         self.zooms = np.stack([self._zooms(cloud, tree) for cloud, tree in zip(self.clouds, self._trees, strict=True)])
@@ -241,10 +249,11 @@ class PatchSource:
         """Read the training shapes of .npz files, or the held-out ones, of each file every tenth.
 
         Clean clouds (N, 3) are named `<shape>/<resolution>`; with them may be `<shape>/surface`, a finer one from which
-        nothing is drawn, and `<shape>/normals`, the unit normals of the one of most points.
+        nothing is drawn, `<shape>/normals`, the unit normals of the one of most points, and `<shape>/eye`, (3,), where
+        the beams came from that met the points.
         """
         shapes: dict[tuple[Path, str], list[npt.NDArray[np.float32]]] = {}
-        beside: dict[str, dict[tuple[Path, str], npt.NDArray[np.float32]]] = {"normals": {}, "surface": {}}
+        beside: dict[str, dict[tuple[Path, str], npt.NDArray[np.float32]]] = {"normals": {}, "surface": {}, "eye": {}}
         for path in paths:
             with np.load(path, allow_pickle=False) as archive:
                 held_out = held_out_shapes(archive.files)
@@ -256,8 +265,7 @@ class PatchSource:
                         beside[what][path, shape] = archive[name]
                     else:
                         shapes.setdefault((path, shape), []).append(archive[name])
-        normals, surfaces = ([beside[what].get(key) for key in shapes] for what in ("normals", "surface"))
-        return cls(list(shapes.values()), normals, surfaces)
+        return cls(list(shapes.values()), *([known.get(key) for key in shapes] for known in beside.values()))
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""
@@ -282,7 +290,7 @@ class PatchSource:
             time = max(EARLIEST, 1 - scale * FIRST_NOISE[level] / NOISE_STD)
         else:
             time = rng.uniform(0, 1)
-        here = clean + (1 - time) * NOISE_STD / scale * drawn_noise(rng, len(clean))
+        here = clean + (1 - time) * NOISE_STD / scale * drawn_noise(rng, clean, self.eyes[which])
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.
         distance = np.square(here - origin).sum(axis=1)
@@ -308,8 +316,22 @@ def near_first(rng: np.random.Generator) -> npt.NDArray[np.int64]:
     return np.argsort(turn)
 
 
-def drawn_noise(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
-    """Draw noise of std 1 for the points of one patch or cloud, (count, 3): the paper's, or another (`OTHER_NOISE`)."""
+def drawn_noise(
+    rng: np.random.Generator, clean: npt.NDArray[np.float64], eye: npt.NDArray[np.float64] | None = None
+) -> npt.NDArray[np.float64]:
+    """Draw noise of std 1 for points (N, 3) of one patch or cloud: the paper's, or another (`OTHER_NOISE`): (N, 3).
+
+    Where beams from the place `eye` (3,) met the points, of `ALONG_BEAMS` it is along them only.
+    """
+    noise = _scattered(rng, len(clean))
+    if eye is None or rng.random() >= ALONG_BEAMS:
+        return noise
+    beams = clean - eye
+    along: npt.NDArray[np.float64] = noise[:, :1] * beams / np.linalg.norm(beams, axis=1, keepdims=True)
+    return along
+
+
+def _scattered(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     noise = rng.standard_normal((count, 3))
     if rng.random() >= OTHER_NOISE:
         return noise

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 
 from straightpcf.model.train.data import (
+    ALONG_BEAMS,
     AROUND,
     CANDIDATES,
     EARLIEST,
@@ -53,6 +54,9 @@ class DevicePatchSource:
         self._clouds = _padded(source.clouds, device)
         self._noise = torch.from_numpy(FIRST_NOISE).float().to(device)
         self._zooms = torch.from_numpy(source.zooms).float().to(device)
+        # Clouds of no beams have an eye that is not a number, and so no beams.
+        eyes = [np.full(3, np.nan) if eye is None else eye for eye in source.eyes]
+        self._eyes = torch.from_numpy(np.stack(eyes)).float().to(device)[:, None]
         self._surfaces = _Surfaces(source.surfaces, range(len(source.clouds)), source.clouds, device)
         self._passed = _Passed(source.passed, device) if isinstance(source.passed, PassedClouds) else None
 
@@ -72,7 +76,7 @@ class DevicePatchSource:
         seed = gathered(clouds, seeds[:, None])
         clean = gathered(clouds, _nearest(clouds, seed, self._candidates))  # the seed first
         time, scale = self._shown(which, first_passes)
-        noisy = clean + NOISE_STD / scale * _noise(batch_size, clean.shape[1], device)
+        noisy = clean + NOISE_STD / scale * _noise(clean, self._eyes[which])
         here = torch.lerp(noisy, clean, time)
         origin = here[:, :1]
         inside = _near_first(_nearest(here, origin, PATCH_SIZE))  # cut at x_t, as PatchSource does
@@ -172,16 +176,23 @@ def _near_first(inside: torch.Tensor) -> torch.Tensor:
     return inside.gather(1, turn.argsort(dim=1))
 
 
-def _noise(batch_size: int, count: int, device: torch.device) -> torch.Tensor:
-    """Draw noise of std 1, (B, count, 3), of the kinds that `PatchSource` draws, a kind for each patch."""
+def _noise(clean: torch.Tensor, eyes: torch.Tensor) -> torch.Tensor:
+    """Draw noise of std 1 for points (B, n, 3), of the kinds that `drawn_noise` draws, a kind for each patch.
+
+    eyes: (B, 1, 3), where beams came from, not a number where there were none.
+    """
+    batch_size, count, _ = clean.shape
+    device = clean.device
     noise = torch.randn(batch_size, count, 3, device=device)
-    other, heavy, unequal, shape = torch.rand(4, batch_size, 1, 1, device=device)
+    other, heavy, unequal, shape, along = torch.rand(5, batch_size, 1, 1, device=device)
     shape = TAILS[0] + (TAILS[1] - TAILS[0]) * shape
     variance = torch._standard_gamma(shape.expand(-1, count, -1)) / shape
     noise = torch.where((other < OTHER_NOISE) & (heavy < HEAVY_TAILED), noise * variance.sqrt(), noise)
     stds = (STRETCH * torch.randn(batch_size, 1, 3, device=device)).exp()
     stretched = noise * stds / stds.square().mean(dim=2, keepdim=True).sqrt() @ random_rotations(batch_size, device)
-    return torch.where((other < OTHER_NOISE) & (unequal < UNEQUAL), stretched, noise)
+    noise = torch.where((other < OTHER_NOISE) & (unequal < UNEQUAL), stretched, noise)
+    beams = torch.nn.functional.normalize(clean - eyes, dim=2)
+    return torch.where((along < ALONG_BEAMS) & beams.isfinite(), noise[:, :, :1] * beams, noise)
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:

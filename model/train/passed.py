@@ -110,7 +110,7 @@ def _surface(archive: Path, shape: str) -> Surface:
     """Return the finest cloud of a shape with its normals, in its own coordinates."""
     with np.load(archive, allow_pickle=False) as file:
         clouds = {name.split("/")[1]: file[name] for name in file.files if name.startswith(f"{shape}/")}
-    normals, surface = clouds.pop("normals", None), clouds.pop("surface", None)
+    normals, surface, _ = (clouds.pop(beside, None) for beside in ("normals", "surface", "eye"))
     if not clouds:
         raise InvalidOptions(f"{archive} has no shape {shape}, of which there are clouds after a pass")
     return Surface.of(clouds.values(), normals, surface)

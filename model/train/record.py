@@ -21,6 +21,8 @@ from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["write_passed"]
 
+Floats = npt.NDArray[np.float64]
+
 LEVELS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03)  # noise std, in radii of the bounding sphere
 COARSEST_SHARE = 0.75  # of the clouds; a finer one takes several times as long
 
@@ -39,11 +41,11 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
         archive = data[int(rng.integers(len(data)))]
         names = list(shapes[archive])
         shape = names[int(rng.integers(len(names)))]
-        clouds = shapes[archive][shape]
+        clouds, eye = shapes[archive][shape]
         finer = clouds[1:] if rng.random() >= COARSEST_SHARE else []
         clean = (finer or clouds[:1])[int(rng.integers(len(finer or clouds[:1])))]
         own = CloudFrame.of(clean)
-        noise = LEVELS[int(rng.integers(len(LEVELS)))] * drawn_noise(rng, len(clean))
+        noise = LEVELS[int(rng.integers(len(LEVELS)))] * drawn_noise(rng, clean, eye)
         run = _Recording(denoiser, own.enter(clean) + noise, DenoiseOptions(iterations=3 if finer else 4))
         for _ in run.patches():
             pass
@@ -58,22 +60,24 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
 class _Recording(Run):
     """Keep what each pass but the first is given, as long as it is shown in the usual size."""
 
-    seen: tuple[npt.NDArray[np.float64], ...] = ()
+    seen: tuple[Floats, ...] = ()
 
-    def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[object]:  # type: ignore[override]
+    def _pass(self, here: Floats, tiling: Tiling, left: int) -> Iterator[object]:  # type: ignore[override]
         if self.iterations > 1 and self.readings[-1].zoom == 1.0:
             self.seen = (*self.seen, here.copy())
         yield from super()._pass(here, tiling, left)
 
 
-def _training_clouds(archive: Path) -> dict[str, list[npt.NDArray[np.float64]]]:
-    """Return the clean clouds of each shape that is not held out, the coarsest first."""
+def _training_clouds(archive: Path) -> dict[str, tuple[list[Floats], Floats | None]]:
+    """Return the clean clouds of each shape that is not held out, the coarsest first, and where its beams came from."""
     with np.load(archive, allow_pickle=False) as file:
         held_out = held_out_shapes(file.files)
         names = [name.split("/") for name in file.files]
-        found: dict[str, list[npt.NDArray[np.float64]]] = {}
+        found: dict[str, tuple[list[Floats], Floats | None]] = {}
         for shape, points in sorted((s, int(what)) for s, what in names if what.isdigit() and s not in held_out):
-            found.setdefault(shape, []).append(file[f"{shape}/{points}"].astype(np.float64))
+            if shape not in found:
+                found[shape] = [], file[f"{shape}/eye"].astype(np.float64) if f"{shape}/eye" in file else None
+            found[shape][0].append(file[f"{shape}/{points}"].astype(np.float64))
         return found
 
 

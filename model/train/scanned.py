@@ -1,0 +1,127 @@
+"""Training clouds made in code: solids as a scanner sees them, from one side, along the beams of a raster.
+
+python -m straightpcf.model.train.scanned scanned.npz --count 36
+
+A depth camera, a laser scanner or a height raster measures along beams: its points lie on rows and columns, and its
+noise along the beams only. A denoiser that has never seen that takes such noise for two sheets of a thin wall.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import fpsample
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.solids import FAMILIES
+
+__all__ = ["COUNTS", "Scanner", "write_scanned"]
+
+Floats = npt.NDArray[np.float64]
+
+COUNTS = (5_000, 12_000, 30_000)  # points of a shape's clouds, about; one side of a solid has half of its surface
+_DENSE = 500_000  # points of a solid that its scan is made from
+_SURFACE = 50_000
+_DISTANCE = (2.5, 40.0)  # from the centre of a solid, in radii
+_ASPECT = (1.0, 5.0)  # of the steps from row to row and along a row
+_SLANTED = 0.25  # cosine below which a surface returns nothing
+_PILOT = 128  # beams a side of the raster that tells how fine it has to be
+# Around a beam the nearest sample within a mean spacing is on the surface that it meets, unless another within 2.5
+# lies in front; where surfaces are steep, what is in front by less than the slant allows is the same one.
+_NEAR, _FRONT = 1.0, 2.5
+
+
+class Scanner:
+    """A solid's samples, (M, 3) with their unit normals, seen from the place `eye` (3,), turned about the view."""
+
+    def __init__(self, xyz: Floats, normals: Floats, eye: Floats, roll: float) -> None:
+        """Sort out what faces the eye; xyz is in the frame where its bounding sphere has radius 1."""
+        view = -eye / np.linalg.norm(eye)
+        across = np.linalg.svd(view[None])[2][1:]  # two more axes
+        turn = Rotation.from_rotvec(roll * view).as_matrix()
+        self.eye = eye
+        self.axes = np.stack([*(across @ turn.T), view])  # rows: along a row, from row to row, away
+        away = xyz - eye
+        facing = (away * normals).sum(axis=1) < 0
+        self._away, self._normals = away[facing], normals[facing]
+        seen = self._away @ self.axes.T
+        self._depth = seen[:, 2]
+        self._tree = cKDTree(seen[:, :2] / seen[:, 2:])
+        self._spacing = 1 / (np.sqrt(len(xyz) / (4 * np.pi)) * np.linalg.norm(eye))
+        self._half = np.abs(self._tree.data).max()  # of the image, which is square
+
+    def raster(self, rng: np.random.Generator, count: int, aspect: float, *, shifted: bool) -> Floats:
+        """Scan about `count` points (N, 3), rows `aspect` times as far apart as the points of a row.
+
+        shifted: each row begins at a place of its own, as a spinning mirror's do; else there are columns too.
+        """
+        pilot = self._beams(rng, 2 * self._half / _PILOT, 1.0, shifted=False)
+        share = len(self._met(pilot)) / len(pilot)
+        step = 2 * self._half * np.sqrt(share / (count * aspect))
+        return self._met(self._beams(rng, step, aspect, shifted=shifted))
+
+    def _beams(self, rng: np.random.Generator, step: float, aspect: float, *, shifted: bool) -> Floats:
+        """Return the places (n, 2) in the image, at depth 1, that the beams go through."""
+        row = np.arange(-self._half, self._half, step)
+        rows = np.arange(-self._half, self._half, step * aspect)
+        phase = rng.random(len(rows)) * step if shifted else np.zeros(len(rows))
+        return np.stack([(row + phase[:, None]).ravel(), np.repeat(rows, len(row))], axis=1)
+
+    def _met(self, beams: Floats) -> Floats:
+        """Return where beams (n, 2) meet the surface, (N, 3): each on the plane of the sample that is nearest to it."""
+        _, near = self._tree.query(beams, k=32, distance_upper_bound=_FRONT * self._spacing)
+        off = np.linalg.norm(self._tree.data[np.minimum(near, self._tree.n - 1)] - beams[:, None], axis=2)
+        depth = np.append(self._depth, np.inf)[near]
+        front = depth.min(axis=1, keepdims=True)
+        slack = _FRONT * self._spacing * self._depth.max() / _SLANTED
+        off = np.where(depth <= front + slack, off, np.inf)
+        best = off.argmin(axis=1)[:, None]
+        hit = np.take_along_axis(off, best, axis=1)[:, 0] < _NEAR * self._spacing
+        sample = np.take_along_axis(near, best, axis=1)[hit, 0]
+        ways = np.column_stack([beams[hit], np.ones(hit.sum())]) @ self.axes
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        slant = (ways * self._normals[sample]).sum(axis=1)
+        steep = slant > -_SLANTED
+        length = (self._away[sample] * self._normals[sample]).sum(axis=1)[~steep] / slant[~steep]
+        met: Floats = self.eye + length[:, None] * ways[~steep]
+        return met
+
+
+def write_scanned(path: Path, count: int, *, seed: int = 0) -> None:
+    """Write an .npz of `count` solids, each scanned at `COUNTS`: `scanned<number>/<points>`, float32, as PUNet's are.
+
+    With them `scanned<number>/eye`, (3,), the place that the beams come from, and the whole surface with its normals,
+    `scanned<number>/surface` and `/normals`, (50 000, 3). All in the frame where the solid's bounding sphere has
+    radius 1.
+    """
+    arrays: dict[str, npt.NDArray[np.generic]] = {}
+    for number in range(count):
+        rng = np.random.default_rng([seed, number, 1])
+        xyz, normals = FAMILIES[number % len(FAMILIES)](rng).sample(rng, _DENSE)
+        xyz = CloudFrame.of(xyz).enter(xyz)
+        way = rng.standard_normal(3)
+        eye = way / np.linalg.norm(way) * np.exp(rng.uniform(*np.log(_DISTANCE)))
+        scanner = Scanner(xyz, normals, eye, rng.uniform(0, 2 * np.pi))
+        for wanted in COUNTS:
+            aspect = np.exp(rng.uniform(*np.log(_ASPECT))) if rng.random() < 0.5 else 1.0
+            points = scanner.raster(rng, wanted, aspect, shifted=bool(rng.random() < 0.3))
+            arrays[f"scanned{number:03d}/{len(points)}"] = points.astype(np.float32)
+        kept = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), _SURFACE, 7, 0)
+        arrays[f"scanned{number:03d}/surface"] = xyz[kept].astype(np.float32)
+        arrays[f"scanned{number:03d}/normals"] = normals[kept].astype(np.float32)
+        arrays[f"scanned{number:03d}/eye"] = eye.astype(np.float32)
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--count", type=int, default=36)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    write_scanned(options.path, options.count, seed=options.seed)
