@@ -141,8 +141,13 @@ class Filter:
         its noise, and in parts where that fills the patches (`NoiseReader`), and less than what the network asks for is
         made of steps that are more than the noise (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
-        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS.
+        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS, or one of threads, coverage, euler_steps and
+        full_evaluations is below 1.
         """
+        counts = {"threads": threads, "euler_steps": euler_steps, "full_evaluations": full_evaluations}
+        for name, value in {**counts, "coverage": coverage}.items():
+            if value is not None and not value >= 1:
+                raise InvalidOptions(f"{name} is {value}; it must be at least 1")
         self.tile_points = TILE_POINTS if tile_points is None else tile_points
         if self.tile_points < MIN_TILE_POINTS:
             raise InvalidOptions(f"tile_points is {tile_points}; it must be at least {MIN_TILE_POINTS}")

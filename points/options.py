@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Literal, TypeVar
 
 from straightpcf.points.errors import InvalidOptions
@@ -33,17 +34,14 @@ class DenoiseOptions:
     normals: Literal["keep", "recompute"] = "keep"
 
     def __post_init__(self) -> None:
-        """Validate every field."""
-        if self.iterations != "auto" and (
-            isinstance(self.iterations, bool)
-            or not isinstance(self.iterations, int)
-            or not 1 <= self.iterations <= MAX_ITERATIONS
-        ):
-            raise InvalidOptions(f"iterations is {self.iterations!r}; it must be {_ITERATIONS}")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed < 2**32:
-            raise InvalidOptions(f"seed is {self.seed!r}; it must be {_SEED}")
-        if not (isinstance(self.strength, (int, float)) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
+        """Validate every field; numbers of other libraries, as numpy's scalars, become Python's."""
+        if self.iterations != "auto":
+            passes = _whole("iterations", self.iterations, range(1, MAX_ITERATIONS + 1), _ITERATIONS)
+            object.__setattr__(self, "iterations", passes)
+        object.__setattr__(self, "seed", _whole("seed", self.seed, range(2**32), _SEED))
+        if not (isinstance(self.strength, Real) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
             raise InvalidOptions(f"strength is {self.strength!r}; it must be {_STRENGTH}")
+        object.__setattr__(self, "strength", float(self.strength))
         if self.normals not in ("keep", "recompute"):
             raise InvalidOptions(f'normals is {self.normals!r}; it must be "keep" or "recompute"')
 
@@ -64,6 +62,12 @@ class DenoiseOptions:
             strength=default.strength if strength is None else _number("strength", float, strength, _STRENGTH),
             normals=default.normals if normals is None else normals.strip().lower(),  # type: ignore[arg-type]
         )
+
+
+def _whole(name: str, value: object, allowed: range, limit: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) not in allowed:
+        raise InvalidOptions(f"{name} is {value!r}; it must be {limit}")
+    return int(value)
 
 
 def _iterations(text: str) -> int | Literal["auto"]:

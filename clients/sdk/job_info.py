@@ -72,6 +72,10 @@ class JobInfo:
     report: Report | None
     json: Mapping[str, Any] = field(repr=False, compare=False)
 
+    def __hash__(self) -> int:
+        """Hash the id: a report's mappings and an error have no hash of their own."""
+        return hash(self.id)
+
     @property
     def finished(self) -> bool:
         """Tell whether nothing more happens to it."""

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from straightpcf.clients.sdk.events import Completed, Event, parse_event
 from straightpcf.clients.sdk.retry import Failure
-from straightpcf.points.errors import ConnectionFailed
+from straightpcf.points.errors import ConnectionFailed, InvalidRequest
 from straightpcf.points.wire.patches import PatchFrame, PatchReader
 
 __all__ = ["Body", "Events", "Patches", "Receiver"]
@@ -71,6 +71,9 @@ class Events:
     """Follow a job; `take` hands out what came since it was last called. value: the job when it is finished."""
 
     def __init__(self, *, after: int = 0) -> None:
+        """Begin behind event `after`; raises InvalidRequest where no event can have that number."""
+        if isinstance(after, bool) or not isinstance(after, int) or after < 0:
+            raise InvalidRequest(f"after is {after!r}; it must be the id of an event, 0 or more")
         self.furthest = after
         self.value: Any = None
         self._came: list[Event] = []

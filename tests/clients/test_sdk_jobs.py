@@ -366,5 +366,14 @@ def test_what_is_no_id_state_or_page_is_refused_alike_over_both_wires(client: Cl
     for size in (0, 201):
         with pytest.raises(InvalidRequest, match=f"page_size is {size}"):
             list(client.jobs.list(page_size=size))
+    job = client.jobs.create(SMALL, iterations=1)
+    with pytest.raises(InvalidRequest, match="after is -3"):
+        next(job.events(after=-3))
     with pytest.raises(FileNotFoundError, match="is no file"):
         client.jobs.create(tmp_path)
+
+
+def test_jobs_may_be_kept_in_sets(client: Client) -> None:
+    job = client.jobs.create(SMALL, iterations=1)
+    finished = job.wait()
+    assert len({finished, job.refresh()}) == 1

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
-from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, JobCanceled, TooFewPoints
+from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, far_group, noisy, sphere, torus
 
@@ -290,6 +290,21 @@ def test_as_a_whole_and_in_parts_is_the_mean_of_both(tiny: Filter, monkeypatch: 
         results.append(tiny.denoise(cloud, ONE_PASS).xyz)
     np.testing.assert_allclose(results[2], (results[0] + results[1]) / 2, atol=1e-12)
     assert not np.allclose(results[0], results[1])
+
+
+@pytest.mark.parametrize(("name", "value"), [("threads", -1), ("threads", 0), ("coverage", 0.5), ("euler_steps", 0)])
+def test_a_filter_is_told_what_it_needs_at_least(tiny: Filter, name: str, value: float) -> None:
+    with pytest.raises(InvalidOptions, match=f"{name} is {value}; it must be at least 1"):
+        Filter(tiny.network, **{name: value})  # type: ignore[arg-type]
+
+
+def test_options_may_be_numbers_of_numpy(tiny: Filter) -> None:
+    said = DenoiseOptions(iterations=np.int64(1), seed=np.uint32(3), strength=np.float32(0.5))  # type: ignore[arg-type]
+    assert said == DenoiseOptions(iterations=1, seed=3, strength=0.5)
+    assert [type(value) for value in (said.iterations, said.seed, said.strength)] == [int, int, float]
+    for wrong in ({"iterations": np.int64(11)}, {"seed": np.float64(1)}, {"strength": np.nan}, {"iterations": True}):
+        with pytest.raises(InvalidOptions, match="must be"):
+            DenoiseOptions(**wrong)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
