@@ -1,11 +1,12 @@
-"""Filter scenes that are known exactly, as four scanners see them; how far points lie from the truth, part by part.
+"""Filter scenes that are known exactly, as five scanners see them; how far points lie from the truth, part by part.
 
-python -m benchmarks.scenes [lidar mobile aerial depth] [--noise 1.0] [--iterations auto] [--json FILE]
+python -m benchmarks.scenes [lidar mobile aerial depth raster] [--noise 1.0] [--iterations auto] [--json FILE]
 
 A street (ground, kerbs, walls with sills, cars, poles, railings, wires, leaves) and a room, of boxes, rods and balls.
 Beams meet them exactly; noise is along the beam: 0.02 m for a spinning LiDAR of 64 rings and for a profile scanner
 driven through the street, 0.03 m from the air, and 0.0012 + 0.0019 (z - 0.4)^2 m at depth z for a depth camera (Nguyen,
-Izadi, Lovell 2012, axial noise of the Kinect). --noise multiplies it.
+Izadi, Lovell 2012, axial noise of the Kinect). A raster has heights of hills, every metre, with 0.6 m of noise in
+height alone. --noise multiplies it.
 """
 
 from __future__ import annotations
@@ -119,6 +120,30 @@ class Ball(Part):
         """Measure from the centre, less the radius."""
         shell: Floats = np.linalg.norm(xyz - np.array(self.centre), axis=1) - self.radius
         return shell
+
+
+@dataclass(frozen=True)
+class Hills(Part):
+    """Ground of waves; beams meet it straight from above."""
+
+    @staticmethod
+    def height(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return the height above places, and how steep the ground is there."""
+        angles = 0.05 * x, 0.04 * y
+        along = 0.625 * np.cos(angles[0]) * np.cos(angles[1]) + 0.002 * y
+        across = -0.5 * np.sin(angles[0]) * np.sin(angles[1]) + 0.002 * x
+        return 12.5 * np.sin(angles[0]) * np.cos(angles[1]) + 0.002 * x * y, np.hypot(along, across)
+
+    def meet(self, origin: Floats, beam: Floats) -> Floats:
+        """Go down to the ground."""
+        far: Floats = np.where(beam[:, 2] == -1, origin[:, 2] - self.height(origin[:, 0], origin[:, 1])[0], np.inf)
+        return far
+
+    def distance(self, xyz: Floats) -> Floats:
+        """Measure across the slope, to first order in the height."""
+        height, steep = self.height(xyz[:, 0], xyz[:, 1])
+        above: Floats = (xyz[:, 2] - height) / np.hypot(1, steep)
+        return above
 
 
 def street(seed: int = 0) -> list[Part]:
@@ -244,11 +269,19 @@ def _depth(noise: float) -> Scan:
     )
 
 
+def _raster(noise: float) -> Scan:
+    x, y = _grid(np.arange(-50, 50, 1.0), np.arange(-50, 50, 1.0))
+    down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (len(x), 3))
+    origin = np.stack([x, y, np.full(len(x), 100.0)], axis=1)
+    return _scan([Hills("hills")], origin, down, 200.0, lambda xyz: np.full(len(xyz), 0.6 * noise))
+
+
 SCANNERS: dict[str, Callable[[float], Scan]] = {
     "lidar": _lidar,
     "mobile": _mobile,
     "aerial": _aerial,
     "depth": _depth,
+    "raster": _raster,
 }
 
 

@@ -8,6 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from benchmarks import scenes
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -65,3 +70,19 @@ def test_scenes(tmp_path: Path) -> None:
     assert whole["points"] > 1000
     assert {"ground", "wall"} <= {row["part"] for row in parts}
     assert 0 < whole["after"] < 2 * whole["before"]
+
+
+def test_a_raster_of_hills_has_its_noise_in_height_alone() -> None:
+    scan = scenes.SCANNERS["raster"](1.0)
+    assert len(scan.clean) == 10_000
+    assert np.ptp(scan.clean[:, 2]) > 20
+    off = scan.noisy - scan.clean
+    assert np.abs(off[:, :2]).max() == 0
+    assert off[:, 2].std() == pytest.approx(0.6, rel=0.05)
+    assert np.abs(scenes.distance_to(scan.parts, scan.clean)).max() < 1e-9
+    # Across the slope, by looking: the nearest of many points of the ground.
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-4, 4, 0.02), np.arange(-4, 4, 0.02)))
+    ground = np.stack([x, y, scenes.Hills.height(x, y)[0]], axis=1)
+    some = np.array([[0, 0, 0.5], [1, -2, 1.0], [-2, 1, -2.5]])
+    nearest = np.linalg.norm(ground[:, None] - some, axis=2).min(axis=0)
+    assert scenes.distance_to(scan.parts, some) == pytest.approx(nearest, rel=0.02)
