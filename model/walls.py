@@ -18,42 +18,46 @@ __all__ = ["between_walls", "has_walls", "share_between_walls"]
 
 Floats = npt.NDArray[np.float64]
 
-# Of 24 the plane lies along walls that are up to 1.2 times as far apart as points, of 64 up to twice as far.
-_AROUND = (24, 64)
+# Of 24 the plane lies along walls that are up to 1.2 times as far apart as points, of 64 up to twice as far. So many
+# reach where walls bend, and have a quadric instead; of 100 it lies along walls where of 64 it may lie between them.
+_AROUND = (24, 64, 100)
+_BENT = 64
 # The share of neighbours nearer to their plane than half of their std: 0.31 and more of one surface with noise,
 # 0.29 where that is uniform along one axis, 0.02 to 0.28 of walls. A sharp rim with noise has few, too, in some of a
 # cloud's patches, so it has walls where that is so of a fifth of them.
 _MIDWAY, _FEW, _MAY_BE_FEW, _SOME = 0.5, 0.27, 0.28, 0.2
 _THICK = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
-# Moves across, in that std, up to which all is made of them, and nothing from 1.5 times as many on: as many as noise
-# asks for, of which the share midway says how much there is.
-_MORE, _PER_MIDWAY, _RAMP = 0.14, 1.3, 0.5
+# Moves across, in stds of the points about the wall that each is on: up to the first all is made of them, from the
+# second on nothing. What the network tells apart it moves by 0.4 to 1.0 of that, what it joins or blurs by 1.2 to 1.8.
+_WHOLE, _NONE = 1.1, 1.3
 _SAMPLES = 128  # points of a patch that are looked at
 
 
 @dataclass(frozen=True)
 class _Heights:
-    """What the neighbours of n points have as heights over their planes.
+    """What the neighbours of n points have as heights over their planes, or quadrics.
 
     thick: (n,) bool, whether the neighbours have more height than an edge; midway: the share of those of thick points
-    that are; std: of half of the thick points, or less; normals: (n, 3), the planes'.
+    that are; noise: the std about walls on both sides, of half of the thick points, or less; normals: (n, 3), the
+    planes'.
     """
 
     thick: npt.NDArray[np.bool_]
     midway: float
-    std: float
+    noise: float
     normals: Floats
 
     @classmethod
     def of(cls, near: Neighbourhoods) -> _Heights:
         """Look at the neighbourhoods of n points."""
-        height = near.along_axes()[:, :, 0]
+        shape = _Shape.of(near)
+        height = shape.left_of(near.along_axes()[:, :, 0])
         stds = np.sqrt(np.square(height).mean(axis=1))
         thick = stds > _THICK * near.radii
         if not thick.any():
             return cls(thick, 1.0, 0.0, near.normals)
         midway = float(np.mean(np.abs(height[thick]) < _MIDWAY * stds[thick, None]))
-        return cls(thick, midway, float(np.median(stds[thick])), near.normals)
+        return cls(thick, midway, float(np.median(shape.noise_about_walls(height)[thick])), near.normals)
 
     def are_walls(self, few: float) -> bool:
         return self.midway < few and bool(self.thick.mean() > 0.5)
@@ -64,12 +68,48 @@ class _Heights:
         if not self.are_walls(_FEW) or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
-        most = (_MORE + _PER_MIDWAY * self.midway) * self.std
-        return float(np.clip(1.0 - (np.sqrt(np.square(rise).mean()) / most - 1.0) / _RAMP, 0.0, 1.0))
+        beside_noise = np.sqrt(np.square(rise).mean()) / max(self.noise, 1e-300)
+        return float(np.clip((_NONE - beside_noise) / (_NONE - _WHOLE), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Planes or quadrics over the neighbourhoods of n points, for least squares.
+
+    terms: (n, k, m), those of each neighbour; inverse: (n, m, m), of the normal equations.
+    """
+
+    terms: Floats
+    inverse: Floats
+
+    @classmethod
+    def of(cls, near: Neighbourhoods) -> _Shape:
+        """Take quadrics where there are as many neighbours as _BENT."""
+        _, u, v = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
+        terms = [np.ones_like(u), u, v]
+        if u.shape[1] >= _BENT:
+            terms += [u * u, u * v, v * v]
+        stacked = np.stack(terms, axis=2)
+        equations = stacked.mT @ stacked + 1e-9 * np.eye(len(terms))  # points in a line leave some of them open
+        return cls(stacked, np.linalg.inv(equations))
+
+    def left_of(self, values: Floats) -> Floats:
+        """Return what the fits leave of values (n, k)."""
+        fits = self.inverse @ (self.terms.mT @ values[:, :, None])
+        left: Floats = values - (self.terms @ fits)[:, :, 0]
+        return left
+
+    def noise_about_walls(self, height: Floats) -> Floats:
+        """Return the std (n,) of heights (n, k) about two walls of the same shape, each point on its own side."""
+        side = self.left_of(np.where(height > 0, 1.0, -1.0))
+        apart = (side * height).sum(axis=1) / np.maximum(np.square(side).sum(axis=1), 1e-300)
+        _, count, terms = self.terms.shape
+        left: Floats = np.square(height - apart[:, None] * side).sum(axis=1) / max(1, count - terms - 1)
+        return np.sqrt(left)
 
 
 def between_walls(near: Nearest) -> list[bool]:
-    """Say whether points of a patch may be on walls close together, by their 24 and by their 64 nearest."""
+    """Say whether points of a patch may be on walls close together, by their nearest 24, 64 and 100."""
     return [_Heights.of(near.first(count)).are_walls(_MAY_BE_FEW) for count in _AROUND]
 
 

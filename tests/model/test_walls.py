@@ -55,6 +55,32 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
     assert any("walls closer together" in warning for warning in result.warnings)
 
 
+def pipe(count: int, seed: int = 0) -> np.ndarray:
+    """Return points (count, 3) that lie by chance on an open pipe of radius 0.5 and wall 0.1, 1.6 long."""
+    rng = np.random.default_rng(seed)
+    radius = rng.choice([0.4, 0.5], count, p=[4 / 9, 5 / 9])
+    around = rng.uniform(0, 2 * np.pi, count)
+    return np.column_stack([radius * np.cos(around), radius * np.sin(around), rng.uniform(-0.8, 0.8, count)])
+
+
+@pytest.mark.parametrize("count", [1000, 1500])
+def test_walls_that_bend_stay_apart_too(count: int) -> None:
+    rough = noisy(pipe(count), 0.0025)
+    result = load_filter(threads=2).denoise(rough)
+    rings = np.hypot(result.xyz[:, 0], result.xyz[:, 1])
+    off = np.minimum(np.abs(rings - 0.4), np.abs(rings - 0.5))
+    assert np.sqrt(np.square(off).mean()) < 1.1 * 0.0025
+    assert any("walls closer together" in warning for warning in result.warnings)
+
+
+def test_noise_within_bent_walls_is_taken_away_where_points_are_many() -> None:
+    rough = noisy(pipe(4000), 0.01)
+    result = load_filter(threads=2).denoise(rough)
+    rings = np.hypot(result.xyz[:, 0], result.xyz[:, 1])
+    off = np.minimum(np.abs(rings - 0.4), np.abs(rings - 0.5))
+    assert np.sqrt(np.square(off).mean()) < 0.7 * 0.01
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_that_half_of_a_sheet_has_is_not_two_walls(seed: int) -> None:
     rng = np.random.default_rng(seed)
