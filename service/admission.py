@@ -67,7 +67,15 @@ class Limits:
                 f"{load.bytes} bytes of jobs are kept or to come and up to {spool} would be added; "
                 f"this server keeps {self.max_spool_bytes}"
             )
-        coming = load.coming + spool - written
+        self._check_free(load.coming + spool - written, free_bytes)
+
+    def check_incoming(self, load: Load, free_bytes: int, *, incoming: int) -> None:
+        """Raise SpoolFull if uploads on their way in, of `incoming` bytes so far, take what accepted jobs need."""
+        if incoming > self.max_spool_bytes:
+            raise SpoolFull(f"{incoming} bytes of uploads are coming in; this server keeps {self.max_spool_bytes}")
+        self._check_free(load.coming, free_bytes)
+
+    def _check_free(self, coming: int, free_bytes: int) -> None:
         if free_bytes - coming < self.min_free_bytes:
             raise SpoolFull(
                 f"the server's disk has {free_bytes} bytes left, of which jobs may take {coming}; "

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
-from straightpcf.points.errors import InvalidRequest, JobExpired, JobNotFinished, ServerBusy
+from straightpcf.points.errors import InvalidRequest, JobExpired, JobNotFinished, NotFound, ServerBusy
 from straightpcf.points.formats import estimate_points, format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE
@@ -165,6 +165,14 @@ class Engine:
         """Lend a file for a request's body; what is not submitted is removed."""
         return self._folders.upload()
 
+    async def check_incoming(self) -> None:
+        """Raise SpoolFull where bodies leave accepted jobs no room; to be asked again while one comes in.
+
+        How large a body is need not be said before, and many may have been let in at once.
+        """
+        load, incoming = await self._call(JobStore.load), await asyncio.to_thread(self._folders.incoming_bytes)
+        self.limits.check_incoming(load, self._folders.free_bytes(), incoming=incoming)
+
     async def submit(self, source: Path, request: JobRequest) -> tuple[JobRecord, bool]:
         """Commit one job, or find the one that the same request made; return it and whether it is new.
 
@@ -254,11 +262,14 @@ class Engine:
     async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncGenerator[JobEvent, None]:
         """Yield what happened behind event `after`, and then what happens, until `completed`.
 
-        Raises ServerBusy where this server ends first.
+        Raises ServerBusy where this server ends first, and NotFound where the job is deleted, also if its id is used
+        again.
         """
+        folder: str | None = None
         while True:
             news = self._news_of(id)
-            record = await self.get(id, owner=owner)
+            record = await self._same(id, owner, folder)
+            folder = record.folder
             for event in await self._call(JobStore.events, id, after):
                 after = event.seq
                 yield event
@@ -281,12 +292,13 @@ class Engine:
         """Yield the patch stream (docs/api.md) as it grows; a second attempt goes on where the first one ended.
 
         That is sound because the same input, options and weights give the same bytes. Raises what the job failed with,
-        and ServerBusy where this server ends first.
+        ServerBusy where this server ends first, and NotFound where the job is deleted, also if its id is used again.
         """
-        sent = 0
+        sent, folder = 0, None
         while True:
             news = self._news_of(id)
-            record = await self.get(id, owner=owner)
+            record = await self._same(id, owner, folder)
+            folder = record.folder
             path = self._folders.path(record.folder) / f"patches-{record.attempts}"
             while chunk := await asyncio.to_thread(_read_from, path, sent):
                 sent += len(chunk)
@@ -296,7 +308,8 @@ class Engine:
             await self._further(news)
         if record.error is not None:
             raise record.error
-        if sent == 0:
+        record = await self._same(id, owner, folder)  # removed while it was read, it may have ended early
+        if sent == 0 or record.state == "expired":
             raise JobExpired(f"the patches of job {id} have been removed")
 
     async def cancel(self, id: str, *, owner: str = "") -> JobRecord:
@@ -333,6 +346,13 @@ class Engine:
 
         with full_disk_as_spool_full():
             return await asyncio.get_running_loop().run_in_executor(self._thread, carry_out)
+
+    async def _same(self, id: str, owner: str, folder: str | None) -> JobRecord:
+        """Return a job as it is; raises NotFound where it is not the one of that folder any more, if one is given."""
+        record = await self.get(id, owner=owner)
+        if folder is not None and record.folder != folder:
+            raise NotFound(f"job {id} was deleted, and its id is another's now")
+        return record
 
     async def _further(self, news: asyncio.Event, seconds: float = POLL_SECONDS) -> None:
         """Return when there may be something new; raises ServerBusy when this server is about to end."""

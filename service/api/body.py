@@ -42,15 +42,16 @@ def declared_size(request: Request) -> int:
     return int(declared) if declared.isascii() and declared.isdigit() else 0
 
 
-async def receive_upload(request: Request, target: Path, *, limits: Limits) -> Upload:
+async def receive_upload(request: Request, target: Path) -> Upload:
     """Write the request's file to `target`: a form's part named "file", or any other body as it is.
 
-    Raises TooManyBytes, UnknownFormat, InvalidRequest, ServerBusy; ClientDisconnect if the client goes away.
+    Raises TooManyBytes, SpoolFull, UnknownFormat, InvalidRequest, ServerBusy; ClientDisconnect if the client goes away.
     """
     coding = ",".join(request.headers.getlist("content-encoding"))
     if any(each.strip().lower() not in ("", "identity") for each in coding.split(",")):
         raise UnknownFormat(f"the body is encoded as {coding[:40]!r}; send it as it is")
-    return await in_time(request.app.state.engine, _receive(request, target, limits))
+    engine: Engine = request.app.state.engine
+    return await in_time(engine, _receive(request, target, engine))
 
 
 async def in_time(engine: Engine, receiving: Coroutine[Any, Any, _T]) -> _T:
@@ -67,14 +68,14 @@ async def in_time(engine: Engine, receiving: Coroutine[Any, Any, _T]) -> _T:
         await asyncio.wait([task])  # it writes to a file that is about to be removed
 
 
-async def _receive(request: Request, target: Path, limits: Limits) -> Upload:
+async def _receive(request: Request, target: Path, engine: Engine) -> Upload:
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     with await asyncio.to_thread(target.open, "wb") as file:
-        spool = SpoolFile(file)
+        spool = SpoolFile(file, engine)
         if kind == b"multipart/form-data":
-            upload = await _receive_form(request, parameters.get(b"boundary", b""), spool, limits)
+            upload = await _receive_form(request, parameters.get(b"boundary", b""), spool, engine.limits)
         else:
-            upload = await _receive_raw(request, spool, limits)
+            upload = await _receive_raw(request, spool, engine.limits)
         await spool.flush()
     return upload
 
@@ -109,13 +110,15 @@ async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, lim
 class SpoolFile:
     """Gather small pieces and write them in large ones, off the event loop."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
+    def __init__(self, file: IO[bytes], engine: Engine) -> None:
+        self._file, self._engine = file, engine
         self.buffer = bytearray()
 
     async def flush(self, *, above: int = 0) -> None:
-        """Write what was gathered, if it is more than `above` bytes."""
+        """Write what was gathered, if it is more than `above` bytes; raises SpoolFull before jobs have no room left."""
         if len(self.buffer) > above:
+            if above:  # what is small is looked at with its job
+                await self._engine.check_incoming()
             await asyncio.to_thread(self._file.write, self.buffer)
             self.buffer.clear()
 

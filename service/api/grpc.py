@@ -30,7 +30,6 @@ from straightpcf.points.wire.messages import (
     plain_of,
 )
 from straightpcf.points.wire.patches import PatchReader
-from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.body import SpoolFile, in_time
 from straightpcf.service.api.download import open_result
@@ -136,7 +135,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     async def Denoise(self, requests: AsyncIterator[pb.DenoiseRequest], context: Context) -> None:  # noqa: N802
         """Work on one file while its caller listens."""
         async with self._answering(context, "Denoise") as caller:
-            config = (await _first(requests)).config
+            config = (await in_time(self._engine, _first(requests))).config
             # Nobody else knows such a job: it lives as long as its call. Its id is known before it is there, for a call
             # may be cancelled while its job is being committed.
             named = config.job.id or caller.idempotency_key is not None
@@ -166,7 +165,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     ) -> pb.Job:
         """Commit a job."""
         async with self._answering(context, "CreateJob") as caller:
-            config = (await _first(requests)).config
+            config = (await in_time(self._engine, _first(requests))).config
             record, _ = await self._take(config, requests, caller, endpoint="jobs", id=config.id or None)
             return _job(record)
 
@@ -249,7 +248,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
             format_named(config.format)
         await engine.check_room(owner=caller.owner, id=id, idempotency_key=caller.idempotency_key)
         with engine.upload() as source:
-            await in_time(engine, _receive(requests, source, limits=engine.limits))
+            await in_time(engine, _receive(requests, source, engine))
             wanted = JobRequest(
                 options=options,
                 name=file_name(config.filename or None),
@@ -286,15 +285,15 @@ async def _first(requests: AsyncIterator[_Part]) -> _Part:
     return message
 
 
-async def _receive(requests: AsyncIterator[Any], target: Path, *, limits: Limits) -> None:
+async def _receive(requests: AsyncIterator[Any], target: Path, engine: Engine) -> None:
     """Write the chunks of a call to a file."""
     received = 0
     with await asyncio.to_thread(target.open, "wb") as file:
-        spool = SpoolFile(file)
+        spool = SpoolFile(file, engine)
         async for message in requests:
             if message.WhichOneof("part") != "chunk":
                 raise InvalidRequest("a config comes once, before the first chunk")
-            limits.check_bytes(received := received + len(message.chunk))
+            engine.limits.check_bytes(received := received + len(message.chunk))
             spool.buffer += message.chunk
             await spool.flush(above=WRITE_BYTES)
         await spool.flush()

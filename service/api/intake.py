@@ -34,7 +34,7 @@ async def take_job(
     _check_once([name for name, _ in query.multi_items()])  # before the body, so that it need not be read
     _parse_fields(query, more_fields)
     with engine.upload() as source:
-        upload = await receive_upload(request, source, limits=engine.limits)
+        upload = await receive_upload(request, source)
         _check_once([*query, *upload.fields])
         fields = {**query, **upload.fields}
         options, format = _parse_fields(fields, more_fields)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import multiprocessing
 from typing import Any
 
@@ -39,6 +40,8 @@ class WorkerProcess:
             target=run_worker, args=(theirs, spec), daemon=True, name=f"straightpcf-worker-{spec.device}"
         )
         self._process.start()
+        # Where a server ends without `stop`, multiprocessing would ask with SIGTERM, and wait for ever.
+        atexit.register(self._process.kill)
         theirs.close()
         self._loop.add_reader(self._pipe.fileno(), self._read)
         self.ready: asyncio.Future[str] = self._loop.create_future()
@@ -137,6 +140,7 @@ class WorkerProcess:
         """Make sure that the process ends, its end of the pipe being gone or unwanted; say how it ended by itself."""
         code = self._process.exitcode
         self._process.kill()
+        atexit.unregister(self._process.kill)
         if code is None:
             return "was ended"
         return f"ended with exit code {code}" if code >= 0 else f"was killed by signal {-code}"

@@ -91,7 +91,9 @@ class Failed:
 
 def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
     """Serve jobs until the pipe says None or its other end is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the server says when to end
+    # Ctrl-C reaches the whole group, and so does what systemd and `timeout` send: the server says when to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         denoiser = _load(spec)
     except StraightPCFError as error:

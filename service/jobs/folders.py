@@ -46,11 +46,12 @@ class JobFolders:
         """
         with full_disk_as_spool_full():
             handle, name = tempfile.mkstemp(dir=self._incoming)
-            os.close(handle)
             try:
+                fcntl.flock(handle, fcntl.LOCK_EX)  # for as long as somebody may be sending, however slowly
                 yield Path(name)
             finally:
                 Path(name).unlink(missing_ok=True)
+                os.close(handle)
 
     def path(self, folder: str) -> Path:
         """Return where a job's folder is."""
@@ -70,13 +71,24 @@ class JobFolders:
         """Remove a job's files."""
         shutil.rmtree(self.path(folder), ignore_errors=True)
 
+    def remove_all_but_input(self, folder: str) -> None:
+        """Remove what earlier attempts at a job wrote; one that still writes has its files to itself."""
+        with suppress(FileNotFoundError):  # it may be removed meanwhile
+            for path in self.path(folder).iterdir():
+                if path.name != INPUT:
+                    path.unlink(missing_ok=True)
+
     def job_bytes(self, folder: str) -> int:
         """Return how large a job's files are."""
         return _bytes_in(self.path(folder))
 
+    def incoming_bytes(self) -> int:
+        """Return how large all uploads on their way in are."""
+        return _bytes_in(self._incoming)
+
     def used_bytes(self) -> int:
         """Return how large the files of all jobs are, and of all uploads on their way in."""
-        return _bytes_in(self._jobs) + _bytes_in(self._incoming)
+        return _bytes_in(self._jobs) + self.incoming_bytes()
 
     def free_bytes(self) -> int:
         """Return how much room the disk has."""
@@ -87,12 +99,7 @@ class JobFolders:
         dead = []
         for server in {*servers, *self._old_locks()}:
             path = self._lock_path(server)
-            try:
-                with path.open("rb") as lock:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except FileNotFoundError:
-                pass
-            except OSError:
+            if _is_locked(path):
                 continue  # it lives
             path.unlink(missing_ok=True)
             if server in servers:
@@ -102,7 +109,7 @@ class JobFolders:
     def orphans(self) -> list[str]:
         """Name job folders that are old enough to have been committed, and drop uploads that nobody finished."""
         for upload in _old_in(self._incoming):
-            if upload.is_file():  # a folder is none of ours
+            if upload.is_file() and not _is_locked(upload):  # a folder is none of ours
                 upload.unlink(missing_ok=True)
         return [folder.name for folder in _old_in(self._jobs)]
 
@@ -118,6 +125,17 @@ def digest_of(path: Path) -> str:
     """Return a file's sha256 in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_locked(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
 
 
 def _old_in(folder: Path) -> list[Path]:

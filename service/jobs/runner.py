@@ -131,6 +131,7 @@ class JobRunner:
         folder = self._folders.path(record.folder)
         log = _Log(claim, self._call, self._notify)
         try:
+            await asyncio.to_thread(self._folders.remove_all_but_input, record.folder)
             return await self._backend.run(
                 FileJob(
                     id=record.id,

@@ -108,6 +108,7 @@ class JobStore:
         """Return a page, newest first, and the cursor of the next one; raises InvalidRequest on a broken cursor."""
         if unknown := set(states) - set(STATES):
             raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
+        states = set(states)  # SQLite takes only so many values
         where, values = ["owner = ?"], [owner]
         if states:
             where.append(f"state IN ({', '.join('?' * len(states))})")

@@ -21,7 +21,7 @@ from straightpcf.points.errors import (
     UnknownFormat,
 )
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.engine import Engine
+from straightpcf.service.engine import CHUNK_BYTES, Engine
 from tests.service.engines import kinds, play, submit
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -37,6 +37,28 @@ def test_a_job_tells_its_events_in_order_to_those_who_come_early_late_or_again(t
         whole = ["queued", "start", "progress", "log", "output", "completed"]
         assert await early == await kinds(engine, record.id) == whole
         assert await kinds(engine, record.id, after=3) == whole[3:]
+
+    play(tmp_path, scenario)
+
+
+def test_who_follows_a_job_is_not_led_into_another_that_takes_its_id(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        backend.patches = b"A" * (3 * CHUNK_BYTES)
+        await submit(engine, id="one")
+        await engine.wait("one")
+        patches, events = engine.patches("one"), engine.events("one")
+        assert set(await anext(patches)) == {ord("A")}
+        assert (await anext(events)).kind == "queued"
+        await engine.delete("one")
+        backend.patches = b"B" * (3 * CHUNK_BYTES)
+        await submit(engine, b"9 9 9\n", id="one")
+        await engine.wait("one")
+        with pytest.raises(NotFound, match="deleted"):
+            b"".join([chunk async for chunk in patches])
+        kept = [event.kind async for event in events]  # read at once, before the job was deleted
+        assert kept == ["start", "progress", "log", "output", "completed"]
 
     play(tmp_path, scenario)
 

@@ -41,6 +41,44 @@ def test_a_worker_that_dies_costs_an_attempt_and_the_third_one_is_the_last(tmp_p
     play(tmp_path, scenario, *[WorkerDied("killed")] * 4)
 
 
+def test_what_earlier_attempts_wrote_is_removed_when_the_next_begins(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine)
+        folder = tmp_path / "jobs" / record.folder
+        for name in ("patches-1", "result-1"):  # of a server that died
+            (folder / name).write_bytes(b"x")
+        backend.go.set()
+        backend.finish.set()
+        await engine.wait(record.id)
+        assert sorted(path.name for path in folder.iterdir()) == ["input", "patches-2", "result-2"]
+
+    play(tmp_path, scenario, WorkerDied("killed"))
+
+
+def test_bodies_on_their_way_in_leave_accepted_jobs_their_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = [10**6]
+    monkeypatch.setattr(JobFolders, "free_bytes", lambda folders: free[0])
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        await submit(engine, b"x" * 60)
+        coming = (await engine._call(JobStore.load)).coming
+        with engine.upload() as upload, engine.upload() as other:
+            upload.write_bytes(bytes(5000))
+            other.write_bytes(bytes(5000))
+            free[0] = 1000 + coming
+            await engine.check_incoming()
+            free[0] -= 1
+            with pytest.raises(SpoolFull, match="must stay free"):
+                await engine.check_incoming()
+            free[0] = 10**6
+            other.write_bytes(bytes(5001))
+            with pytest.raises(SpoolFull, match="10001 bytes of uploads are coming in"):
+                await engine.check_incoming()
+        await engine.check_incoming()
+
+    play(tmp_path, scenario, min_free_bytes=1000, max_spool_bytes=10_000)
+
+
 def test_a_full_disk_is_said_before_anything_is_written(tmp_path: Path) -> None:
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         with pytest.raises(SpoolFull):

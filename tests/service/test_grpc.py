@@ -6,6 +6,8 @@ import io
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -165,6 +167,12 @@ def test_a_call_against_the_contract_is_refused(stub: Any, name: str) -> None:
     }
 
 
+def test_states_may_be_asked_for_any_number_of_times(stub: Any) -> None:
+    id = done(stub)
+    asked = [pb.JOB_STATE_SUCCEEDED] * 300_000  # SQLite takes a tenth of that as values
+    assert id in {job.id for job in stub.ListJobs(pb.ListJobsRequest(states=asked, limit=200)).jobs}
+
+
 def done(stub: Any) -> str:
     config = pb.JobConfig(filename="cloud.npy", options=pb.DenoiseOptions(iterations=1))
     job = stub.CreateJob(parts(pb.CreateJobRequest, config, SMALL))
@@ -259,6 +267,26 @@ def test_the_committed_stubs_are_what_the_schema_gives(tmp_path: Path) -> None:
             assert same == kept
         elif made.suffix == ".pyi":
             assert made.read_text().splitlines() == kept
+
+
+def test_a_call_that_never_says_its_config_is_told_before_the_server_ends(tmp_path: Path) -> None:
+    with (
+        run_server(tmp_path, "--grpc-port", "0", environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "4"}) as server,
+        grpc.insecure_channel(server.grpc_url.removeprefix("grpc://")) as channel,
+    ):
+        over = threading.Event()
+
+        def nothing() -> Iterator[Any]:
+            over.wait()
+            yield from ()
+
+        call = DenoiseServiceStub(channel).CreateJob.future(nothing())
+        time.sleep(0.5)  # for the call to come in: it leaves no trace
+        server.process.send_signal(signal.SIGTERM)
+        status, info = error_of(call.result)
+        assert (status, info.reason) == ("UNAVAILABLE", "SERVER_BUSY")
+        over.set()
+        server.process.wait(timeout=20)
 
 
 def test_sigterm_lets_a_call_finish(tmp_path: Path) -> None:

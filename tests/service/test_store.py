@@ -61,7 +61,10 @@ def test_an_upload_that_nobody_finished_is_dropped_and_a_folder_beside_it_is_let
         (tmp_path / "jobs" / "job").mkdir()
         for path in (*(tmp_path / "incoming").iterdir(), tmp_path / "jobs" / "job"):
             os.utime(path, (LONG_AGO, LONG_AGO))
-        assert folders.orphans() == ["job"]
+        with folders.upload() as sending:  # slowly: longer than an upload that nobody owns is kept
+            os.utime(sending, (0, 0))
+            assert folders.orphans() == ["job"]
+            assert sending.exists()
         assert [path.name for path in (tmp_path / "incoming").iterdir()] == ["folder"]
 
 
