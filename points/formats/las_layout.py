@@ -12,7 +12,17 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
 
-__all__ = ["EXTRA_BYTES_ID", "LASZIP_ID", "LasHeader", "LasRecord", "dimensions", "read_header"]
+__all__ = [
+    "EXTRA_BYTES_ID",
+    "LASZIP_ID",
+    "LasDimension",
+    "LasHeader",
+    "LasRecord",
+    "dimensions",
+    "read_header",
+    "standard_bytes",
+    "standard_dimensions",
+]
 
 LASZIP_ID = (b"laszip encoded", 22204)
 EXTRA_BYTES_ID = (b"LASF_Spec", 4)
@@ -77,6 +87,16 @@ class LasRecord:
 
 
 @dataclass(frozen=True)
+class LasDimension:
+    """Say where a point has a dimension: its byte, its type, and of that the first bit and the bits of a bit field."""
+
+    at: int
+    dtype: np.dtype[Any]
+    shift: int = 0
+    bits: int | None = None
+
+
+@dataclass(frozen=True)
 class LasHeader:
     """Describe the file; scales, offsets: (3,) float64, position = scale * integer + offset.
 
@@ -123,7 +143,7 @@ def read_header(raw: bytes) -> LasHeader:
     point_format = kind & 0x3F
     if point_format >= len(_POINT_FORMATS):
         raise UnsupportedCloud(f"LAS point format {point_format} is not known; 0 to {len(_POINT_FORMATS) - 1} are")
-    standard = 12 + sum(np.dtype(code).itemsize for _, code in _POINT_FORMATS[point_format])
+    standard = standard_bytes(point_format)
     if row_bytes < standard:
         raise MalformedFile(f"LAS point length is {row_bytes}; point format {point_format} has {standard} bytes")
     scales, offsets = np.frombuffer(raw, "<f8", 3, 131), np.frombuffer(raw, "<f8", 3, 155)
@@ -169,34 +189,48 @@ def _first_extended(raw: bytes, minor: int, begin: int) -> int | None:
     return min((mark for mark in marks if mark), default=None)
 
 
+def standard_bytes(point_format: int) -> int:
+    """Return the bytes of a point without extra ones."""
+    return 12 + sum(np.dtype(code).itemsize for _, code in _POINT_FORMATS[point_format])
+
+
+def standard_dimensions(point_format: int) -> dict[str, LasDimension]:
+    """Return every dimension that points of this format have by themselves, but X, Y, Z."""
+    found: dict[str, LasDimension] = {}
+    at = 12
+    for names, code in _POINT_FORMATS[point_format]:
+        dtype = np.dtype("<" + code)
+        if isinstance(names, str):
+            found[names] = LasDimension(at, dtype)
+        else:
+            shift = 0
+            for name, bits in names:
+                found[name] = LasDimension(at, dtype, shift, bits)
+                shift += bits
+        at += dtype.itemsize
+    return found
+
+
 def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.NDArray[Any]]:
     """Return every dimension of (N, row_bytes) points but X, Y, Z as (N,) or (N, M); bit fields are unpacked."""
     found: dict[str, npt.NDArray[Any]] = {}
-    at = 12
-    for names, code in _POINT_FORMATS[header.point_format]:
-        values = _column(rows, at, code)
-        at += values.dtype.itemsize
-        if isinstance(names, str):
-            found[names] = values
-            continue
-        shift = 0
-        for name, bits in names:
-            found[name] = (values >> shift) & ((1 << bits) - 1)
-            shift += bits
+    for name, standard in standard_dimensions(header.point_format).items():
+        values = _column(rows, standard.at, standard.dtype)
+        found[name] = values if standard.bits is None else (values >> standard.shift) & ((1 << standard.bits) - 1)
+    at = standard_bytes(header.point_format)
     for name, code, width in _extra_dimensions(header, at):
         size = np.dtype(code).itemsize * width
         label = name
         while label in found or label in tuple("xyzXYZ"):
             label = f"extra_{label}"
-        found[label] = rows[:, at : at + size] if width > 1 else _column(rows, at, code)
+        found[label] = rows[:, at : at + size] if width > 1 else _column(rows, at, np.dtype("<" + code))
         at += size
     if at < header.row_bytes:
         found["extra_bytes"] = rows[:, at:]
     return found
 
 
-def _column(rows: npt.NDArray[np.uint8], at: int, code: str) -> npt.NDArray[Any]:
-    dtype = np.dtype("<" + code)
+def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     values: npt.NDArray[Any] = np.ascontiguousarray(rows[:, at : at + dtype.itemsize]).view(dtype)[:, 0]
     return values
 

@@ -6,8 +6,10 @@ import struct
 import sys
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from straightpcf.points.cloud import PointCloud
@@ -131,3 +133,40 @@ def test_attributes_whose_long_names_begin_alike_all_come_back(tmp_path: Path) -
         np.testing.assert_array_equal(values, expected)
     theirs = laspy.read(path)
     assert len(set(theirs.point_format.extra_dimension_names)) == 12
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_attributes_with_names_of_dimensions_are_put_there_or_beside_them(suffix: str, tmp_path: Path) -> None:
+    """laspy opens no file in which an extra dimension is called as a standard one, bit fields included."""
+    held: dict[str, npt.NDArray[Any]] = {
+        "intensity": np.arange(N, dtype=np.float32) * 1300,
+        "return_number": np.arange(N) % 8,
+        "number_of_returns": np.full(N, 7, np.uint8),
+        "classification": np.arange(N) % 32.0,
+        "withheld": np.arange(N) % 2 == 1,
+        "scan_angle_rank": np.arange(N, dtype=np.int16) - 90,
+        "point_source_id": np.arange(N, dtype=np.uint32),
+        "gps_time": np.linspace(0, 1, N, dtype=np.float32),
+    }
+    beside: dict[str, npt.NDArray[Any]] = {
+        "user_data": np.arange(N) * 100.0,
+        "key_point": np.full(N, 2, np.uint8),
+        "synthetic": np.linspace(0, 1, N),
+        "bit_fields": np.arange(N, dtype=np.uint8),
+    }
+    write_cloud(PointCloud(torus(N), held | beside), tmp_path / f"a.{suffix}", format_named(suffix))
+    theirs = laspy.read(tmp_path / f"a.{suffix}")
+    for name, values in held.items():
+        np.testing.assert_array_equal(theirs[name], values.astype(np.float64), name)
+    for name, values in beside.items():
+        np.testing.assert_array_equal(theirs[f"extra_{name}"], values, name)
+    assert not any(np.any(theirs[name]) for name in ("user_data", "key_point", "synthetic"))
+
+
+def test_intensity_that_is_no_whole_number_stays_what_it_is(tmp_path: Path) -> None:
+    """A KITTI frame's is in 0..1, and a table may hold `extra_intensity`, too."""
+    attributes = {"intensity": np.linspace(0, 1, N, dtype=np.float32), "extra_intensity": np.arange(N)}
+    write_cloud(PointCloud(torus(N), attributes), path := tmp_path / "a.las", format_named("las"))
+    theirs = laspy.read(path)
+    np.testing.assert_array_equal(theirs["extra_extra_intensity"], attributes["intensity"])
+    np.testing.assert_array_equal(theirs["extra_intensity"], attributes["extra_intensity"])
