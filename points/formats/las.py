@@ -50,7 +50,7 @@ class Las(Format):
         return head.startswith(b"LASF") and (len(head) > 104 and head[104] >= 0x80) == self.is_compressed
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read every dimension; those of extra bytes are as stored, their own scale and offset not applied."""
+        """Read every dimension; of those of extra bytes the values, where a scale or offset is said float64."""
         raw = path.read_bytes()
         header = read_header(raw)
         check_count(header.points, max_points, where="the LAS header")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,7 @@ COPC_ID = (b"copc", 1)
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 _RECORD_BYTES = 54
 _EXTRA_STRUCT_BYTES = 192
+_HAS_SCALE, _HAS_OFFSET = 0x08, 0x10  # bits of its options
 _EXTRA_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 # ASPRS LAS 1.4 R15, tables 7 to 17: what stands in a point besides X, Y, Z; a tuple is one byte or more of bit fields.
@@ -218,13 +220,13 @@ def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.
         values = _column(rows, standard.at, standard.dtype)
         found[name] = values if standard.bits is None else (values >> standard.shift) & ((1 << standard.bits) - 1)
     at = standard_bytes(header.point_format)
-    for name, code, width in _extra_dimensions(header, at):
-        size = np.dtype(code).itemsize * width
-        label = name
+    for extra in _extra_dimensions(header, at):
+        label = extra.name
         while label in found or label in tuple("xyzXYZ"):
             label = f"extra_{label}"
-        found[label] = rows[:, at : at + size] if width > 1 else _column(rows, at, np.dtype("<" + code))
-        at += size
+        values = rows[:, at : at + extra.width] if extra.width > 1 else _column(rows, at, extra.dtype)
+        found[label] = values if extra.is_plain else _scaled(values, extra)
+        at += extra.dtype.itemsize * extra.width
     if at < header.row_bytes:
         found["extra_bytes"] = rows[:, at:]
     return found
@@ -235,19 +237,42 @@ def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.N
     return values
 
 
-def _extra_dimensions(header: LasHeader, at: int) -> list[tuple[str, str, int]]:
-    """Return name, type and width of the extra bytes that a record describes and the point length has room for."""
+@dataclass(frozen=True)
+class _Extra:
+    """Describe a dimension of extra bytes; width: of bytes that have no type.  Its value is scale * stored + offset."""
+
+    name: str
+    dtype: np.dtype[Any]
+    width: int
+    scale: float
+    offset: float
+
+    @property
+    def is_plain(self) -> bool:
+        return self.scale == 1 and self.offset == 0
+
+
+def _scaled(values: npt.NDArray[Any], extra: _Extra) -> npt.NDArray[np.float64]:
+    with np.errstate(over="ignore", invalid="ignore"):  # floats with a scale may be anything
+        return values.astype(np.float64) * extra.scale + extra.offset
+
+
+def _extra_dimensions(header: LasHeader, at: int) -> list[_Extra]:
+    """Return the extra bytes that a record describes and the point length has room for."""
     record = header.record(*EXTRA_BYTES_ID)
-    found: list[tuple[str, str, int]] = []
+    found: list[_Extra] = []
     data = record.data if record is not None else b""
     for begin in range(0, len(data) - _EXTRA_STRUCT_BYTES + 1, _EXTRA_STRUCT_BYTES):
         kind, options = data[begin + 2], data[begin + 3]
         name = data[begin + 4 : begin + 36].split(b"\0")[0].decode("utf-8", "replace") or f"extra_{len(found)}"
         if kind > len(_EXTRA_TYPES) or (kind == 0 and options == 0):
             break  # the deprecated pairs and triples: left as unnamed extra bytes
-        code, width = (_EXTRA_TYPES[kind - 1], 1) if kind else ("u1", options)
-        at += np.dtype(code).itemsize * width
+        dtype, width = (np.dtype("<" + _EXTRA_TYPES[kind - 1]), 1) if kind else (np.dtype("u1"), options)
+        at += dtype.itemsize * width
         if at > header.row_bytes:
             break
-        found.append((name, code, width))
+        scale = struct.unpack_from("<d", data, begin + 112)[0] if kind and options & _HAS_SCALE else 1.0
+        offset = struct.unpack_from("<d", data, begin + 136)[0] if kind and options & _HAS_OFFSET else 0.0
+        is_usable = math.isfinite(scale) and math.isfinite(offset) and scale != 0
+        found.append(_Extra(name, dtype, width, *((scale, offset) if is_usable else (1.0, 0.0))))
     return found

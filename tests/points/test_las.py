@@ -170,3 +170,23 @@ def test_intensity_that_is_no_whole_number_stays_what_it_is(tmp_path: Path) -> N
     theirs = laspy.read(path)
     np.testing.assert_array_equal(theirs["extra_extra_intensity"], attributes["intensity"])
     np.testing.assert_array_equal(theirs["extra_intensity"], attributes["extra_intensity"])
+
+
+def test_extra_bytes_are_read_with_their_scale_and_offset_and_kept_as_they_are(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=0)
+    header.add_extra_dim(laspy.ExtraBytesParams("Amplitude", "u2", scales=np.array([0.01]), offsets=np.array([0.0])))
+    header.add_extra_dim(laspy.ExtraBytesParams("Deviation", "i4", scales=np.array([0.5]), offsets=np.array([-3.0])))
+    header.add_extra_dim(laspy.ExtraBytesParams("plain", "u2"))
+    theirs = laspy.LasData(header)
+    theirs.x, theirs.y, theirs.z = torus(N).T
+    theirs.Amplitude, theirs.Deviation, theirs.plain = np.arange(N) * 0.25, np.arange(N) - 3.5, np.arange(N)
+    theirs.write(tmp_path / "a.las")
+    cloud, las = read_cloud(tmp_path / "a.las")
+    np.testing.assert_allclose(cloud.attributes["Amplitude"], np.arange(N) * 0.25, atol=1e-12)
+    np.testing.assert_array_equal(cloud.attributes["Deviation"], np.arange(N) - 3.5)
+    assert cloud.attributes["plain"].dtype == np.uint16
+    write_cloud(cloud.with_xyz(cloud.xyz + 1), tmp_path / "b.las", las)
+    again = laspy.read(tmp_path / "b.las")
+    np.testing.assert_array_equal(again.points.array["Amplitude"], theirs.points.array["Amplitude"])
+    write_cloud(cloud, tmp_path / "a.ply", format_named("ply"))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.ply")[0].attributes["Amplitude"], np.arange(N) * 0.25)
