@@ -17,7 +17,16 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import scalar_columns
-from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.text import (
+    Lines,
+    as_integers,
+    as_number,
+    as_numbers,
+    blocks,
+    refuse_binary,
+    replaced,
+    shown,
+)
 from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
 
 __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
@@ -174,7 +183,7 @@ def _are_names(words: Sequence[bytes]) -> bool:
 
 def _is_number(word: bytes) -> bool:
     try:
-        float(word)
+        as_number(word)
     except ValueError:
         return False
     return True

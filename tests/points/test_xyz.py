@@ -94,6 +94,39 @@ def test_a_remark_that_is_no_title_of_the_table_changes_nothing(remark: bytes, t
     np.testing.assert_array_equal(read(tmp_path, remark + b"\n1 2 3 4 5 6\n").xyz, [[1, 2, 3]])
 
 
+@pytest.mark.parametrize(
+    "token",
+    [
+        b"nan(ind)",
+        b"-nan(ind)",
+        b"-nan(snan)",
+        b"-1.#IND",
+        b"-1.#IND00",
+        b"1.#QNAN0",
+        b"1.#SNAN",
+        b"1.#INF",
+        b"-1.#INF00",
+    ],
+)
+def test_what_microsofts_runtimes_print_is_no_number_but_no_name_either(token: bytes, tmp_path: Path) -> None:
+    """The first row of three such words is none of names, and every token stays as it stands."""
+    rows = b"%b %b %b\r\n1 2 3\r\n4 5 %b\r\n" % (token, token, token, token)
+    expected = float(token[: token.index(b"1")] + b"inf") if b"INF" in token else np.nan
+    cloud = read(tmp_path, rows)
+    np.testing.assert_array_equal(cloud.xyz, [[expected] * 3, [1, 2, 3], [4, 5, expected]])
+    moved = cloud.xyz + np.array([0.0, 0.5, 0.0])
+    assert written(tmp_path, cloud.with_xyz(moved)) == rows.replace(b"1 2 3", b"1 2.5 3").replace(b"4 5 ", b"4 5.5 ")
+    ascii_ply = b"ply\nformat ascii 1.0\nelement vertex 3\n"
+    ascii_ply += b"".join(b"property float %c\n" % axis for axis in b"xyz") + b"end_header\n" + rows
+    np.testing.assert_array_equal(read(tmp_path, ascii_ply, "a.ply").xyz, cloud.xyz)
+
+
+@pytest.mark.parametrize("token", [b"nan(", b"1.#", b"1.#INF5", b"nan(0)5", b"d", b"s(1)"])
+def test_what_only_looks_like_it_is_refused(token: bytes, tmp_path: Path) -> None:
+    with pytest.raises(MalformedFile, match="no number"):
+        read(tmp_path, b"1 2 3\n4 5 " + token + b"\n")
+
+
 def test_nan_and_infinite_positions_are_read_and_kept(tmp_path: Path) -> None:
     raw = b"nan NaN -nan\ninf -Inf 1e5\n1 2 3\n"
     cloud = read(tmp_path, raw)
