@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
+from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.scalars import scalar_columns
 
@@ -21,7 +22,6 @@ FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-_RGB = ("red", "green", "blue")
 _RAW = ("bit_fields", "raw_classification")  # what laspy calls the bytes of bit fields
 
 
@@ -31,8 +31,8 @@ def new_las(cloud: PointCloud) -> bytes:
     Attributes with the name of a standard dimension that fit into it take its place, the others become extra bytes.
     """
     scales, offsets, integers = _quantised(cloud.xyz)
-    columns = scalar_columns(cloud.attributes, TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
-    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in _RGB)
+    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
+    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
     has_time = "gps_time" in columns and _is_double(columns["gps_time"])
     point_format = 2 * has_rgb + has_time
     standard = standard_dimensions(point_format)
