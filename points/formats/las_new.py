@@ -16,7 +16,7 @@ from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.scalars import scalar_columns
 
-__all__ = ["TYPES", "new_las"]
+__all__ = ["TYPES", "check_new", "new_las"]
 
 FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
@@ -25,27 +25,24 @@ TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _RAW = ("bit_fields", "raw_classification")  # what laspy calls the bytes of bit fields
 
 
+def check_new(cloud: PointCloud) -> None:
+    """Raise UnsupportedCloud where `new_las` would."""
+    _check_positions(cloud.xyz)
+    _laid_out(cloud)
+
+
 def new_las(cloud: PointCloud) -> bytes:
     """Return a LAS 1.2 file, uncompressed; raises UnsupportedCloud where a position is NaN or infinite.
 
     Attributes with the name of a standard dimension that fit into it take its place, the others become extra bytes.
     """
     scales, offsets, integers = _quantised(cloud.xyz)
-    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
-    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
-    has_time = "gps_time" in columns and _is_double(columns["gps_time"])
-    point_format = 2 * has_rgb + has_time
+    point_format, held, extra = _laid_out(cloud)
     standard = standard_dimensions(point_format)
-    held = {name for name, values in columns.items() if name in standard and _fits(values, standard[name])}
-    extra = _extra(columns, held, {*standard, *_RAW})
-    if len(extra) > MAX_EXTRA_DIMENSIONS:
-        raise UnsupportedCloud(
-            f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"
-        )
     points = np.zeros((len(cloud), standard_bytes(point_format)), np.uint8)
     points[:, :12] = integers.astype("<i4").view(np.uint8)
-    for name in held:
-        _put(points, columns[name], standard[name])
+    for name, values in held.items():
+        _put(points, values, standard[name])
     rows = np.hstack([points, *map(_bytes, extra.values())])
     record = _extra_bytes_record(extra)
     begin = _HEADER_BYTES + len(record)
@@ -57,16 +54,36 @@ def new_las(cloud: PointCloud) -> bytes:
     return head + record + rows.tobytes()
 
 
-def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], npt.NDArray[np.int32]]:
-    if not len(xyz):
-        return [FINEST_USUAL_SCALE] * 3, [0.0] * 3, np.empty((0, 3), np.int32)
+def _laid_out(cloud: PointCloud) -> tuple[int, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    """Return the point format, the columns that its dimensions hold, and those of extra bytes."""
+    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
+    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
+    has_time = "gps_time" in columns and _is_double(columns["gps_time"])
+    point_format = 2 * has_rgb + has_time
+    standard = standard_dimensions(point_format)
+    held = {n: values for n, values in columns.items() if n in standard and _fits(values, standard[n])}
+    extra = _extra(columns, held, {*standard, *_RAW})
+    if len(extra) > MAX_EXTRA_DIMENSIONS:
+        raise UnsupportedCloud(
+            f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"
+        )
+    return point_format, held, extra
+
+
+def _check_positions(xyz: npt.NDArray[np.float64]) -> None:
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
         raise UnsupportedCloud(f"point {row} is {xyz[row].tolist()}; LAS has no place for NaN and infinity")
-    lowest, highest = xyz.min(axis=0), xyz.max(axis=0)
-    if np.abs(xyz).max() > 1e100:
+    if len(xyz) and np.abs(xyz).max() > 1e100:
         raise UnsupportedCloud(f"a coordinate of {np.abs(xyz).max():g} is beyond 1e100, which LAS is not written for")
+
+
+def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], npt.NDArray[np.int32]]:
+    if not len(xyz):
+        return [FINEST_USUAL_SCALE] * 3, [0.0] * 3, np.empty((0, 3), np.int32)
+    _check_positions(xyz)
+    lowest, highest = xyz.min(axis=0), xyz.max(axis=0)
     extent = max(float((highest - lowest).max()), 1e-12)
     finest = 10.0 ** math.ceil(math.log10(extent / 2e9))
     scale = max(finest, min(FINEST_USUAL_SCALE, 10.0 ** (math.floor(math.log10(extent)) - 6)))

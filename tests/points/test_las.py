@@ -69,6 +69,13 @@ def test_what_lazrs_cannot_pack_without_loss_is_refused_as_laz_and_kept_as_las(
     assert all(again.attributes[n].tobytes() == v.tobytes() for n, v in cloud.attributes.items())
 
 
+def test_points_that_have_no_packing_are_refused_by_the_check(tmp_path: Path) -> None:
+    cloud, _ = read_cloud(_waveform_file(tmp_path / "a.las", 4, is_noise=False))
+    format_named("las").check(cloud)
+    with pytest.raises(UnsupportedCloud, match="format 4 cannot be packed as LAZ; write LAS"):
+        format_named("laz").check(cloud)
+
+
 def test_points_that_come_out_of_lazrs_changed_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import lazrs
 
