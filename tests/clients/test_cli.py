@@ -184,6 +184,23 @@ def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None
     assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
 
 
+@pytest.mark.parametrize(
+    ("arrays", "arguments", "code", "text"),
+    [
+        ({"a": torus(1500)}, [], 3, "malformed_file"),
+        ({"a/1": torus(500)}, [], 3, "too_few_points"),
+        ({"a/1": torus(1500)}, ["--device", "cuda:99"], 4, "device_unavailable"),
+    ],
+)
+def test_training_refuses_what_it_cannot_use_by_code(
+    arrays: dict[str, np.ndarray], arguments: list[str], code: int, text: str, tmp_path: Path
+) -> None:
+    np.savez(data := tmp_path / "shapes.npz", **arrays)
+    command = ["train", "vm", "--data", str(data), "--run-dir", str(tmp_path / "run"), *arguments]
+    done = CliRunner().invoke(app, command)
+    assert (done.exit_code, text in done.stderr) == (code, True), done.stderr
+
+
 def test_a_stage_without_the_one_before_is_a_usage_error(tmp_path: Path) -> None:
     np.savez(data := tmp_path / "shapes.npz", **{"a/1500": torus(1500).astype(np.float32)})
     done = cli("train", "cvm", "--data", data, "--run-dir", tmp_path / "run")
