@@ -99,6 +99,8 @@ def _whole(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any] | None:
         numbers = np.stack([values.astype(np.float64) for values in columns], axis=1)
     if not ((numbers >= 0) & (numbers < 2**16) & (numbers == np.rint(numbers))).all():
         return None
+    if numbers.max(initial=0) == 1 and any(kind.kind == "f" for kind in kinds):
+        return None  # floats of 0 and 1 may as well be the whole range
     return numbers.astype(np.uint8 if (numbers < 256).all() else np.uint16)
 
 

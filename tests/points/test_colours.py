@@ -114,6 +114,7 @@ def test_alpha_is_kept_where_it_says_something() -> None:
     [
         {"red": BYTES[:, 0], "green": BYTES[:, 1]},
         three(BYTES / 255),
+        three(BYTES // 255 * 1.0),
         three(-BYTES.astype(np.int32)),
         {"rgb": WORDS.astype(np.float64)},
         {"rgb": WORDS.view("<f4"), "red": BYTES[:, 0]},
