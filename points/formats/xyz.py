@@ -165,7 +165,7 @@ class Pts(Xyz):
         return [*cloud.beside, *(name for name in held if name not in columns), *rounded]
 
     def _new_file(self, cloud: PointCloud) -> bytes:
-        """Lay out what the format has columns for; with a colour, intensity is there and a whole number."""
+        """Lay out what the format has columns for; with a colour, intensity is there."""
         return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(cloud.attributes)), " ")
 
 
@@ -297,9 +297,7 @@ def _pts_columns(attributes: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.ND
     columns = scalar_columns({n: attributes[n] for n in _PTS_COLUMNS[7] if n in attributes}, _TYPES, taken=AXES)
     if not all(name in columns and columns[name].dtype.str[1:] in ("u1", "u2") for name in RGB):
         return {name: columns[name] for name in ("intensity",) if name in columns}
-    intensity = columns.get("intensity", np.zeros(0))
-    if not (np.isfinite(intensity) & (intensity == np.rint(intensity))).all() or not len(intensity):
-        intensity = np.zeros(len(columns["red"]), np.uint8)  # readers of colour take it for a whole number
+    intensity = columns.get("intensity", np.zeros(len(columns["red"]), np.uint8))
     rgb = {name: columns[name] >> 8 if columns[name].itemsize > 1 else columns[name] for name in RGB}
     return {"intensity": intensity, **rgb}
 
