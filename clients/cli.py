@@ -65,6 +65,8 @@ class _Commands(TyperGroup):
             raise typer.Exit(exit_code(error)) from error
 
 
+_TRAINING_DATA = "Clean clouds: an NPZ of (N, 3) floats, N >= 1000, called <shape>/<resolution>; may be given again."
+
 app = typer.Typer(
     cls=_Commands,
     help="Clean noisy point clouds: the same points, in the same order, on the surface.",
@@ -253,7 +255,7 @@ def version() -> None:
 @app.command()
 def train(
     stage: Annotated[Stage, typer.Argument(help="vm: one velocity module; cvm: the coupled stack; dm: the distance.")],
-    data: Annotated[list[Path], typer.Option(help="Clean clouds, an NPZ; may be given again.")],
+    data: Annotated[list[Path], typer.Option(help=_TRAINING_DATA)],
     run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that is found there is resumed.")],
     iterations: Annotated[int, typer.Option(min=1)] = 20_000,
     batch_size: Annotated[int, typer.Option(min=1)] = 16,

@@ -59,7 +59,7 @@ class AsyncClient:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
-        name: str | None = None,
+        name: str | Path | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Denoised:
@@ -95,7 +95,7 @@ class AsyncJobs:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
-        name: str | None = None,
+        name: str | Path | None = None,
         id: str | None = None,
         idempotency_key: str | None = None,
     ) -> AsyncJob:

@@ -65,7 +65,7 @@ class Client:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
-        name: str | None = None,
+        name: str | Path | None = None,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Denoised:
@@ -110,7 +110,7 @@ class Jobs:
         strength: float = 1.0,
         normals: Normals = "keep",
         format: str | None = None,
-        name: str | None = None,
+        name: str | Path | None = None,
         id: str | None = None,
         idempotency_key: str | None = None,
     ) -> Job:

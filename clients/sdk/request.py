@@ -100,7 +100,7 @@ def upload_call(
     strength: float,
     normals: Normals | str = "keep",
     format: str | None,
-    name: str | None = None,
+    name: str | Path | None = None,
     key: str | None = None,
     id: str | None = None,
 ) -> Call:
@@ -114,7 +114,7 @@ def upload_call(
     if target is not None:
         check_target(target)
     own_name, body = _name_and_body(source)
-    name = name or own_name
+    name = _sendable(name or own_name)
     if name is None and isinstance(body, bytes):
         recognised(body[:HEAD_BYTES], None)
     if target is not None and format is None:
@@ -232,6 +232,11 @@ def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     if hasattr(source, "read"):
         raise InvalidRequest("a source is a path, bytes, an array or an open3d cloud; of an open file, give its bytes")
     return "cloud.npy", _npy(np.asarray(getattr(source, "points", source)))
+
+
+def _sendable(name: str | Path | None) -> str | None:
+    """Return a file's name as text that every transport carries; bytes of it that are no UTF-8 become `?`."""
+    return None if name is None else os.fspath(name).encode("utf-8", "replace").decode()
 
 
 def _npy(xyz: npt.NDArray[Any]) -> bytes:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from straightpcf.model.allocator import keep_large_buffers
+from straightpcf.model.filter import _device
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
@@ -86,12 +87,13 @@ def train(
     (`coupled_loss`).
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed, thread
     and process count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
-    missing or unfit.
+    missing or unfit, DeviceUnavailable, and what `PatchSource.read` does.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
     if passed and stage != "cvm":
         raise InvalidOptions(f"clouds after passes are for stage 'cvm', not for {stage!r}")
+    place = torch.device(_device(device))
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)
@@ -100,7 +102,6 @@ def train(
     rng = np.random.default_rng(seed)
     run_dir.mkdir(parents=True, exist_ok=True)
     state_path = run_dir / STATE_FILE
-    place = torch.device(device)
     if place.type == "cuda":
         torch.cuda.set_device(place)  # captures and Triton work on the current one
 

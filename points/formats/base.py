@@ -47,6 +47,9 @@ class Format(ABC):
         """Name what a cloud read of another format holds and a file of this one does not, or only rounded."""
         return [*cloud.beside, *not_held(cloud.attributes, self.types)]
 
+    def check(self, cloud: PointCloud) -> None:  # noqa: B027 - most formats hold every cloud
+        """Raise what `write` would of a cloud read of another format, wherever its points are then moved to."""
+
     @abstractmethod
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write a cloud: into the file it came from, as `cloud.source` holds it, or else into a new one."""

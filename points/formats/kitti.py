@@ -57,6 +57,10 @@ class Kitti(Format):
         held = "intensity" if _has_intensity(cloud) else None
         return [*cloud.beside, *(name for name in cloud.attributes if name != held)]
 
+    def check(self, cloud: PointCloud) -> None:
+        """Raise UnsupportedCloud where float32 does not hold the cloud."""
+        _new_rows(cloud)
+
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the rows with their positions replaced; a cloud of another format as float32, intensity or 0."""
         source = cloud.source
@@ -66,14 +70,18 @@ class Kitti(Format):
             put_positions({name: rows[:, axis] for axis, name in enumerate(AXES)}, cloud.xyz, source.xyz)
             path.write_bytes(out)
             return
-        table = np.zeros((len(cloud), 4), "<f4")
-        table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
-        _check_rounding(cloud.xyz, table[:, :3])
-        if _has_intensity(cloud):
-            with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
-                wide = cloud.attributes["intensity"].astype(np.float64)
-            table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
-        path.write_bytes(table.tobytes())
+        path.write_bytes(_new_rows(cloud).tobytes())
+
+
+def _new_rows(cloud: PointCloud) -> npt.NDArray[np.float32]:
+    table = np.zeros((len(cloud), 4), "<f4")
+    table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
+    _check_rounding(cloud.xyz, table[:, :3])
+    if _has_intensity(cloud):
+        with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
+            wide = cloud.attributes["intensity"].astype(np.float64)
+        table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
+    return table
 
 
 def _has_intensity(cloud: PointCloud) -> bool:

@@ -14,8 +14,8 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.las_layout import EXTRA_BYTES_ID, LASZIP_ID, LasHeader, dimensions, read_header
-from straightpcf.points.formats.las_new import TYPES, new_las
-from straightpcf.points.formats.laz_codec import pack, packing_record, unpack
+from straightpcf.points.formats.las_new import TYPES, check_new, new_las
+from straightpcf.points.formats.laz_codec import check_packing, pack, packing_record, unpack
 from straightpcf.points.formats.positions import AXES, moved
 
 __all__ = ["Las", "Laz"]
@@ -50,7 +50,7 @@ class Las(Format):
         return head.startswith(b"LASF") and (len(head) > 104 and head[104] >= 0x80) == self.is_compressed
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read every dimension; those of extra bytes are as stored, their own scale and offset not applied."""
+        """Read every dimension; of those of extra bytes the values, where a scale or offset is said float64."""
         raw = path.read_bytes()
         header = read_header(raw)
         check_count(header.points, max_points, where="the LAS header")
@@ -69,6 +69,14 @@ class Las(Format):
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name nothing of a file that is only packed or unpacked."""
         return [] if isinstance(cloud.source, LasSource) else super().left_behind(cloud)
+
+    def check(self, cloud: PointCloud) -> None:
+        """Raise UnsupportedCloud where no new file can be written; LAZ wants its library, too, and a known layout."""
+        source = cloud.source
+        if not isinstance(source, LasSource):
+            check_new(cloud)
+        if self.is_compressed:
+            check_packing(source.header if isinstance(source, LasSource) else None)
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read, packed or not, with its moved points requantised; or a new one."""

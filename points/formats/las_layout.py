@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,17 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
 
-__all__ = ["EXTRA_BYTES_ID", "LASZIP_ID", "LasHeader", "LasRecord", "dimensions", "read_header"]
+__all__ = [
+    "EXTRA_BYTES_ID",
+    "LASZIP_ID",
+    "LasDimension",
+    "LasHeader",
+    "LasRecord",
+    "dimensions",
+    "read_header",
+    "standard_bytes",
+    "standard_dimensions",
+]
 
 LASZIP_ID = (b"laszip encoded", 22204)
 EXTRA_BYTES_ID = (b"LASF_Spec", 4)
@@ -20,6 +31,7 @@ COPC_ID = (b"copc", 1)
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 _RECORD_BYTES = 54
 _EXTRA_STRUCT_BYTES = 192
+_HAS_SCALE, _HAS_OFFSET = 0x08, 0x10  # bits of its options
 _EXTRA_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 # ASPRS LAS 1.4 R15, tables 7 to 17: what stands in a point besides X, Y, Z; a tuple is one byte or more of bit fields.
@@ -77,6 +89,16 @@ class LasRecord:
 
 
 @dataclass(frozen=True)
+class LasDimension:
+    """Say where a point has a dimension: its byte, its type, and of that the first bit and the bits of a bit field."""
+
+    at: int
+    dtype: np.dtype[Any]
+    shift: int = 0
+    bits: int | None = None
+
+
+@dataclass(frozen=True)
 class LasHeader:
     """Describe the file; scales, offsets: (3,) float64, position = scale * integer + offset.
 
@@ -123,7 +145,7 @@ def read_header(raw: bytes) -> LasHeader:
     point_format = kind & 0x3F
     if point_format >= len(_POINT_FORMATS):
         raise UnsupportedCloud(f"LAS point format {point_format} is not known; 0 to {len(_POINT_FORMATS) - 1} are")
-    standard = 12 + sum(np.dtype(code).itemsize for _, code in _POINT_FORMATS[point_format])
+    standard = standard_bytes(point_format)
     if row_bytes < standard:
         raise MalformedFile(f"LAS point length is {row_bytes}; point format {point_format} has {standard} bytes")
     scales, offsets = np.frombuffer(raw, "<f8", 3, 131), np.frombuffer(raw, "<f8", 3, 155)
@@ -169,51 +191,88 @@ def _first_extended(raw: bytes, minor: int, begin: int) -> int | None:
     return min((mark for mark in marks if mark), default=None)
 
 
+def standard_bytes(point_format: int) -> int:
+    """Return the bytes of a point without extra ones."""
+    return 12 + sum(np.dtype(code).itemsize for _, code in _POINT_FORMATS[point_format])
+
+
+def standard_dimensions(point_format: int) -> dict[str, LasDimension]:
+    """Return every dimension that points of this format have by themselves, but X, Y, Z."""
+    found: dict[str, LasDimension] = {}
+    at = 12
+    for names, code in _POINT_FORMATS[point_format]:
+        dtype = np.dtype("<" + code)
+        if isinstance(names, str):
+            found[names] = LasDimension(at, dtype)
+        else:
+            shift = 0
+            for name, bits in names:
+                found[name] = LasDimension(at, dtype, shift, bits)
+                shift += bits
+        at += dtype.itemsize
+    return found
+
+
 def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.NDArray[Any]]:
     """Return every dimension of (N, row_bytes) points but X, Y, Z as (N,) or (N, M); bit fields are unpacked."""
     found: dict[str, npt.NDArray[Any]] = {}
-    at = 12
-    for names, code in _POINT_FORMATS[header.point_format]:
-        values = _column(rows, at, code)
-        at += values.dtype.itemsize
-        if isinstance(names, str):
-            found[names] = values
-            continue
-        shift = 0
-        for name, bits in names:
-            found[name] = (values >> shift) & ((1 << bits) - 1)
-            shift += bits
-    for name, code, width in _extra_dimensions(header, at):
-        size = np.dtype(code).itemsize * width
-        label = name
+    for name, standard in standard_dimensions(header.point_format).items():
+        values = _column(rows, standard.at, standard.dtype)
+        found[name] = values if standard.bits is None else (values >> standard.shift) & ((1 << standard.bits) - 1)
+    at = standard_bytes(header.point_format)
+    for extra in _extra_dimensions(header, at):
+        label = extra.name
         while label in found or label in tuple("xyzXYZ"):
             label = f"extra_{label}"
-        found[label] = rows[:, at : at + size] if width > 1 else _column(rows, at, code)
-        at += size
+        values = rows[:, at : at + extra.width] if extra.width > 1 else _column(rows, at, extra.dtype)
+        found[label] = values if extra.is_plain else _scaled(values, extra)
+        at += extra.dtype.itemsize * extra.width
     if at < header.row_bytes:
         found["extra_bytes"] = rows[:, at:]
     return found
 
 
-def _column(rows: npt.NDArray[np.uint8], at: int, code: str) -> npt.NDArray[Any]:
-    dtype = np.dtype("<" + code)
+def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     values: npt.NDArray[Any] = np.ascontiguousarray(rows[:, at : at + dtype.itemsize]).view(dtype)[:, 0]
     return values
 
 
-def _extra_dimensions(header: LasHeader, at: int) -> list[tuple[str, str, int]]:
-    """Return name, type and width of the extra bytes that a record describes and the point length has room for."""
+@dataclass(frozen=True)
+class _Extra:
+    """Describe a dimension of extra bytes; width: of bytes that have no type.  Its value is scale * stored + offset."""
+
+    name: str
+    dtype: np.dtype[Any]
+    width: int
+    scale: float
+    offset: float
+
+    @property
+    def is_plain(self) -> bool:
+        return self.scale == 1 and self.offset == 0
+
+
+def _scaled(values: npt.NDArray[Any], extra: _Extra) -> npt.NDArray[np.float64]:
+    with np.errstate(over="ignore", invalid="ignore"):  # floats with a scale may be anything
+        return values.astype(np.float64) * extra.scale + extra.offset
+
+
+def _extra_dimensions(header: LasHeader, at: int) -> list[_Extra]:
+    """Return the extra bytes that a record describes and the point length has room for."""
     record = header.record(*EXTRA_BYTES_ID)
-    found: list[tuple[str, str, int]] = []
+    found: list[_Extra] = []
     data = record.data if record is not None else b""
     for begin in range(0, len(data) - _EXTRA_STRUCT_BYTES + 1, _EXTRA_STRUCT_BYTES):
         kind, options = data[begin + 2], data[begin + 3]
         name = data[begin + 4 : begin + 36].split(b"\0")[0].decode("utf-8", "replace") or f"extra_{len(found)}"
         if kind > len(_EXTRA_TYPES) or (kind == 0 and options == 0):
             break  # the deprecated pairs and triples: left as unnamed extra bytes
-        code, width = (_EXTRA_TYPES[kind - 1], 1) if kind else ("u1", options)
-        at += np.dtype(code).itemsize * width
+        dtype, width = (np.dtype("<" + _EXTRA_TYPES[kind - 1]), 1) if kind else (np.dtype("u1"), options)
+        at += dtype.itemsize * width
         if at > header.row_bytes:
             break
-        found.append((name, code, width))
+        scale = struct.unpack_from("<d", data, begin + 112)[0] if kind and options & _HAS_SCALE else 1.0
+        offset = struct.unpack_from("<d", data, begin + 136)[0] if kind and options & _HAS_OFFSET else 0.0
+        is_usable = math.isfinite(scale) and math.isfinite(offset) and scale != 0
+        found.append(_Extra(name, dtype, width, *((scale, offset) if is_usable else (1.0, 0.0))))
     return found

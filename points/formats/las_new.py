@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,42 +12,41 @@ import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
+from straightpcf.points.formats.colours import RGB, in_16_bits
+from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.scalars import scalar_columns
 
-__all__ = ["TYPES", "new_las"]
+__all__ = ["TYPES", "check_new", "new_las"]
 
 FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-_RGB = ("red", "green", "blue")
+_RAW = ("bit_fields", "raw_classification")  # what laspy calls the bytes of bit fields
+
+
+def check_new(cloud: PointCloud) -> None:
+    """Raise UnsupportedCloud where `new_las` would."""
+    _check_positions(cloud.xyz)
+    _laid_out(cloud)
 
 
 def new_las(cloud: PointCloud) -> bytes:
     """Return a LAS 1.2 file, uncompressed; raises UnsupportedCloud where a position is NaN or infinite.
 
-    Attributes with the name and type of a standard dimension take its place, the others become extra bytes.
+    Attributes with the name of a standard dimension that fit into it take its place, the others become extra bytes.
     """
     scales, offsets, integers = _quantised(cloud.xyz)
-    columns = scalar_columns(cloud.attributes, TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
-    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in _RGB)
-    has_time = "gps_time" in columns and columns["gps_time"].dtype == np.float64
-    point_format = 2 * has_rgb + has_time
-    dtype = _row_dtype(has_time=has_time, has_rgb=has_rgb)
-    extra = {name: values for name, values in columns.items() if not _is_standard(dtype, name, values)}
-    if len(extra) > MAX_EXTRA_DIMENSIONS:
-        raise UnsupportedCloud(
-            f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"
-        )
-    labels = {name: f"extra {number}" for number, name in enumerate(extra)}  # a label of its own beside "intensity"
-    rows = np.zeros(len(cloud), np.dtype([*dtype.descr, *((labels[n], v.dtype.str) for n, v in extra.items())]))
-    for axis, name in enumerate(("X", "Y", "Z")):
-        rows[name] = integers[:, axis]
-    for name, values in columns.items():
-        rows[labels.get(name, name)] = values
+    point_format, held, extra = _laid_out(cloud)
+    standard = standard_dimensions(point_format)
+    points = np.zeros((len(cloud), standard_bytes(point_format)), np.uint8)
+    points[:, :12] = integers.astype("<i4").view(np.uint8)
+    for name, values in held.items():
+        _put(points, values, standard[name])
+    rows = np.hstack([points, *map(_bytes, extra.values())])
     record = _extra_bytes_record(extra)
     begin = _HEADER_BYTES + len(record)
-    head = _header(len(cloud), begin, 1 if extra else 0, point_format, rows.dtype.itemsize)
+    head = _header(len(cloud), begin, 1 if extra else 0, point_format, rows.shape[1])
     head += struct.pack("<6d", *scales, *offsets)
     for axis in range(3):
         bounds = (integers[:, axis].max(), integers[:, axis].min()) if len(cloud) else (0, 0)
@@ -55,16 +54,36 @@ def new_las(cloud: PointCloud) -> bytes:
     return head + record + rows.tobytes()
 
 
-def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], npt.NDArray[np.int32]]:
-    if not len(xyz):
-        return [FINEST_USUAL_SCALE] * 3, [0.0] * 3, np.empty((0, 3), np.int32)
+def _laid_out(cloud: PointCloud) -> tuple[int, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
+    """Return the point format, the columns that its dimensions hold, and those of extra bytes."""
+    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
+    has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
+    has_time = "gps_time" in columns and _is_double(columns["gps_time"])
+    point_format = 2 * has_rgb + has_time
+    standard = standard_dimensions(point_format)
+    held = {n: values for n, values in columns.items() if n in standard and _fits(values, standard[n])}
+    extra = _extra(columns, held, {*standard, *_RAW})
+    if len(extra) > MAX_EXTRA_DIMENSIONS:
+        raise UnsupportedCloud(
+            f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"
+        )
+    return point_format, held, extra
+
+
+def _check_positions(xyz: npt.NDArray[np.float64]) -> None:
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
         raise UnsupportedCloud(f"point {row} is {xyz[row].tolist()}; LAS has no place for NaN and infinity")
-    lowest, highest = xyz.min(axis=0), xyz.max(axis=0)
-    if np.abs(xyz).max() > 1e100:
+    if len(xyz) and np.abs(xyz).max() > 1e100:
         raise UnsupportedCloud(f"a coordinate of {np.abs(xyz).max():g} is beyond 1e100, which LAS is not written for")
+
+
+def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], npt.NDArray[np.int32]]:
+    if not len(xyz):
+        return [FINEST_USUAL_SCALE] * 3, [0.0] * 3, np.empty((0, 3), np.int32)
+    _check_positions(xyz)
+    lowest, highest = xyz.min(axis=0), xyz.max(axis=0)
     extent = max(float((highest - lowest).max()), 1e-12)
     finest = 10.0 ** math.ceil(math.log10(extent / 2e9))
     scale = max(finest, min(FINEST_USUAL_SCALE, 10.0 ** (math.floor(math.log10(extent)) - 6)))
@@ -78,17 +97,44 @@ def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], 
     return [scale] * 3, offsets, integers.astype(np.int32)
 
 
-def _row_dtype(*, has_time: bool, has_rgb: bool) -> np.dtype[Any]:
-    fields = [("X", "<i4"), ("Y", "<i4"), ("Z", "<i4"), ("intensity", "<u2"), ("returns", "u1")]
-    fields += [("classification", "u1"), ("scan_angle_rank", "i1"), ("user_data", "u1"), ("point_source_id", "<u2")]
-    fields += [("gps_time", "<f8")] if has_time else []
-    fields += [(name, "<u2") for name in _RGB] if has_rgb else []
-    return np.dtype(fields)
+def _is_double(values: npt.NDArray[Any]) -> bool:
+    """Say whether (N,) numbers are the same as float64."""
+    return values.dtype.kind == "f" or values.dtype.itemsize < 8
 
 
-def _is_standard(dtype: np.dtype[Any], name: str, values: npt.NDArray[Any]) -> bool:
-    # The classification byte of these point formats holds five bits and three flags: not for any u1.
-    return name not in ("classification", "returns") and name in (dtype.names or ()) and dtype[name] == values.dtype
+def _fits(values: npt.NDArray[Any], dimension: LasDimension) -> bool:
+    """Say whether (N,) numbers are ones that the dimension holds."""
+    if dimension.dtype.kind == "f":
+        return _is_double(values)
+    limits = np.iinfo(dimension.dtype)
+    low, high = limits.min, limits.max if dimension.bits is None else (1 << dimension.bits) - 1
+    with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
+        return bool(((values >= low) & (values <= high) & (values == np.rint(values))).all())
+
+
+def _put(points: npt.NDArray[np.uint8], values: npt.NDArray[Any], dimension: LasDimension) -> None:
+    """Store (N,) numbers that fit in (N, M) points, beside the other bits of a byte."""
+    stored = values.astype(dimension.dtype) << dimension.shift if dimension.bits else values.astype(dimension.dtype)
+    points[:, dimension.at : dimension.at + dimension.dtype.itemsize] |= _bytes(stored)
+
+
+def _bytes(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """View (N,) numbers as (N, bytes of each)."""
+    return np.ascontiguousarray(values).view(np.uint8).reshape(len(values), values.dtype.itemsize)
+
+
+def _extra(
+    columns: Mapping[str, npt.NDArray[Any]], held: Collection[str], reserved: Collection[str]
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the columns that are not held, none with a reserved name: laspy would not open the file."""
+    extra: dict[str, npt.NDArray[Any]] = {}
+    for name, values in columns.items():
+        label = name
+        while label in reserved or (label != name and label in columns):
+            label = f"extra_{label}"
+        if name not in held:
+            extra[label] = values
+    return extra
 
 
 def _extra_bytes_record(extra: dict[str, npt.NDArray[Any]]) -> bytes:

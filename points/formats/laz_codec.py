@@ -14,7 +14,7 @@ from straightpcf.points.errors import MalformedFile, MissingDependency, TooManyB
 from straightpcf.points.formats.base import check_room
 from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader
 
-__all__ = ["pack", "packing_record", "unpack"]
+__all__ = ["check_packing", "pack", "packing_record", "unpack"]
 
 VARIABLE_CHUNKS = 0xFFFFFFFF
 MAX_UNPACKED_BYTES = 4 << 30  # whatever the file's size: layers that never change take no byte at all
@@ -82,6 +82,13 @@ def packing_record(header: LasHeader) -> bytes:
         raise UnsupportedCloud(f"LAS point format {header.point_format} cannot be packed as LAZ; write LAS")
     extra = header.row_bytes - standard[header.point_format]
     return bytes(lazrs.LazVlr.new_for_compression(header.point_format, extra).record_data())
+
+
+def check_packing(header: LasHeader | None) -> None:
+    """Raise MissingDependency without lazrs, UnsupportedCloud where it cannot pack such points; None: new ones."""
+    _lazrs()
+    if header is not None:
+        packing_record(header)
 
 
 def pack(points: bytes, record: bytes, begin: int) -> bytes:

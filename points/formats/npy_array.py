@@ -41,9 +41,10 @@ class NpyHeader:
         return is_float and len(self.shape) == 2 and self.shape[1] >= 3
 
     def is_attribute_of(self, count: int) -> bool:
-        """Say whether this is an array of plain numbers or texts with one row for each of `count` points."""
+        """Say whether this holds plain numbers or texts, one row for each of `count` points and not too wide."""
         is_plain = isinstance(self.descr, str) and _PLAIN.fullmatch(self.descr) is not None
-        return is_plain and len(self.shape) in (1, 2) and self.shape[0] == count
+        is_row_each = len(self.shape) in (1, 2) and self.shape[0] == count
+        return is_plain and is_row_each and math.prod(self.shape[1:]) <= MAX_COLUMNS
 
     @property
     def dtype(self) -> np.dtype[Any]:

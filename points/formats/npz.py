@@ -34,6 +34,7 @@ __all__ = ["KEYS", "MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
 KEYS = ("points", "xyz", "pos")
 MAX_MEMBERS = 1000
 MAX_UNPACKED_BYTES = 4 << 30
+MAX_ATTRIBUTE_BYTES = 4096  # of a point: what is beyond stays packed, as arrays that are no attributes do
 _COPY_BYTES = 1 << 20
 
 
@@ -71,12 +72,14 @@ class Npz(Format):
             rows = view(array, header)
             xyz = widened([rows[:, axis] for axis in range(3)])
             attributes = further_columns(rows)
+            room = MAX_ATTRIBUTE_BYTES * len(xyz)
             for other in members:
                 head = b"" if other is member else _head(archive, other)
                 if not head.startswith(MAGIC):
                     continue
                 found = read_header(head, where=f"array {other.filename[:80]}")
-                if found.is_attribute_of(len(xyz)):
+                if found.is_attribute_of(len(xyz)) and found.data_bytes <= room:
+                    room -= found.data_bytes
                     attributes[_key(other)] = view(_unpacked(archive, other, found), found)
             known = {member.filename, *(f"{name}.npy" for name in attributes)}
             others = tuple(info.filename for info in archive.infolist() if info.filename not in known)

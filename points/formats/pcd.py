@@ -14,6 +14,7 @@ from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room
+from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, widened
 from straightpcf.points.formats.scalars import scalar_columns
@@ -188,6 +189,9 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         field.label: np.concatenate(parts[field.label]) if parts[field.label] else np.empty(0, field.dtype)
         for field in header.fields
     }
+    for name in PACKED:  # four bytes that are called a float, and may come from a number of text
+        if name in found and found[name].dtype.kind == "f" and np.isfinite(found[name]).all():
+            found[name] = found[name].astype(np.float32)
     xyz = widened([found[axis] for axis in AXES])
     none = np.empty(0, np.int64)
     where = {
@@ -201,7 +205,7 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
 def _new_file(cloud: PointCloud) -> bytes:
     """Write a binary file with double positions and every attribute as fields of one value."""
     columns = {axis: cloud.xyz[:, column].astype("<f8") for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(cloud.new_attributes(), _TYPES, taken=AXES)
+    columns |= scalar_columns(packed(cloud.new_attributes()), _TYPES, taken=AXES)
     table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.colours import in_8_bits
 from straightpcf.points.formats.ply_header import PlyElement, PlyHeader, read_header
 from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows
 from straightpcf.points.formats.positions import (
@@ -155,7 +156,7 @@ def _patched(
 def _new_file(cloud: PointCloud) -> bytes:
     """Write binary little-endian with double positions and every attribute as scalar properties."""
     columns = {axis: cloud.xyz[:, column] for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(cloud.new_attributes(), _NAMES, taken=AXES)
+    columns |= scalar_columns(in_8_bits(cloud.new_attributes()), _NAMES, taken=AXES)
     lines = ["ply", "format binary_little_endian 1.0", "comment written by straightpcf", f"element vertex {len(cloud)}"]
     lines += [f"property {_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     table = np.empty(len(cloud), [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()])

@@ -6,6 +6,7 @@ between the replaced tokens is copied byte for byte.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.positions import moved, number_text
 
-__all__ = ["Lines", "as_integers", "as_numbers", "blocks", "refuse_binary", "replaced", "shown"]
+__all__ = ["Lines", "as_integers", "as_number", "as_numbers", "blocks", "refuse_binary", "replaced", "shown"]
 
 BLOCK_BYTES = 1 << 23
 MAX_NUMBER_CHARACTERS = 400
@@ -25,7 +26,9 @@ _Offsets = npt.NDArray[np.int64]
 _IS_SPACE = np.zeros(256, bool)
 _IS_SPACE[list(b" \t\n\v\f\r")] = True
 _IN_NUMBER = np.zeros(256, bool)
-_IN_NUMBER[list(b"0123456789+-.eEnNaAiIfFtTyY\0")] = True
+_IN_NUMBER[list(b"0123456789+-.eEnNaAiIfFtTyYdDqQsS#()\0")] = True
+# What Microsoft's C runtimes print, old and new: -1.#IND00, 1.#INF, -nan(ind).
+_NOT_FINITE = re.compile(rb"([+-]?)(?:1\.#(inf)0*|1\.#(?:ind|[qs]nan)0*|nan\((?:ind|snan)\))", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -176,10 +179,17 @@ def _parse(texts: npt.NDArray[Any], out: npt.NDArray[np.float64]) -> int | None:
         return None
     for row, token in enumerate(texts.tolist()):
         try:
-            out[row] = float(token)
+            out[row] = as_number(token)
         except ValueError:
             return row
     return None
+
+
+def as_number(token: bytes) -> float:
+    """Read one number, infinity and NaN as any C library writes them; raises ValueError."""
+    if (special := _NOT_FINITE.fullmatch(token)) is None:
+        return float(token)
+    return float(special[1] + (special[2] or b"nan"))
 
 
 def replaced(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,9 +15,19 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.colours import RGB, in_8_bits, unpacked
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import scalar_columns
-from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.text import (
+    Lines,
+    as_integers,
+    as_number,
+    as_numbers,
+    blocks,
+    refuse_binary,
+    replaced,
+    shown,
+)
 from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
 
 __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
@@ -26,6 +36,8 @@ MAX_LINE_BYTES = 1 << 23
 _COMMENTS = (b"#", b"//")
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 _BOM = b"\xef\xbb\xbf"
+# What stands behind x, y, z in a .pts file of so many columns.
+_PTS_COLUMNS = {4: ("intensity",), 6: RGB, 7: ("intensity", *RGB)}
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _WHOLE = np.dtype(np.int64)
@@ -111,7 +123,14 @@ class Xyz(Format):
         if isinstance(source, XyzSource) and (source.format == self.name or self._has_layout(source.layout)):
             path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
         else:
-            path.write_bytes(_new_file(cloud, self.delimiter, self.is_counted))
+            path.write_bytes(self._new_file(cloud))
+
+    def _new_file(self, cloud: PointCloud) -> bytes:
+        """Lay out x, y, z and every numeric attribute; their names stand above if there are any."""
+        columns = _axes(cloud) | scalar_columns(unpacked(cloud.attributes), _TYPES, taken=AXES)
+        separator = " " if self.delimiter is None else self.delimiter.decode()
+        names = ("# " if self.delimiter is None else "") + separator.join(columns)
+        return _lines([names] if len(columns) > 3 else [], columns, separator)
 
     def _has_layout(self, layout: Layout) -> bool:
         return layout.delimiter == self.delimiter and (layout.declared is not None) == self.is_counted
@@ -127,11 +146,27 @@ class Csv(Xyz):
 
 
 class Pts(Xyz):
-    """Do as `Xyz`; a new table has the number of points above."""
+    """Do as `Xyz`; a new table has the number of points above, and no names: x y z, intensity, red green blue."""
 
     name = "pts"
     suffixes = (".pts",)
     is_counted = True
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name what is neither intensity nor colour, or has other numbers there."""
+        source = cloud.source
+        if isinstance(source, XyzSource) and self._has_layout(source.layout):
+            return []
+        held = in_8_bits(cloud.attributes)
+        columns = _pts_columns(held)
+        there = [name for name in columns if name in held]
+        other = [name for name in there if not np.array_equal(held[name], columns[name], equal_nan=True)]
+        rounded = (f"{name} (rounded to uint8)" if name in RGB else name for name in other)
+        return [*cloud.beside, *(name for name in held if name not in columns), *rounded]
+
+    def _new_file(self, cloud: PointCloud) -> bytes:
+        """Lay out what the format has columns for; with a colour, intensity is there."""
+        return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(cloud.attributes)), " ")
 
 
 def _layout(raw: bytes) -> Layout:
@@ -165,6 +200,8 @@ def _described(
     if len(cells) > MAX_COLUMNS:
         raise UnsupportedCloud(f"line {line} has more than {MAX_COLUMNS} columns, the limit")
     labels, axes = named_columns(names, list(remarks), cells, line)
+    if declared is not None and labels[0] == "column_1" and len(labels) in _PTS_COLUMNS:
+        labels = (*AXES, *_PTS_COLUMNS[len(labels)])
     return Layout(begin, line, declared, delimiter_of(row), labels, axes)
 
 
@@ -174,7 +211,7 @@ def _are_names(words: Sequence[bytes]) -> bool:
 
 def _is_number(word: bytes) -> bool:
     try:
-        float(word)
+        as_number(word)
     except ValueError:
         return False
     return True
@@ -251,15 +288,23 @@ def _check_columns(table: Lines, numbers: npt.NDArray[np.int64], columns: int) -
         raise MalformedFile(f"line {numbers[row]} has {table.counts[row]} columns, the lines before have {columns}")
 
 
-def _new_file(cloud: PointCloud, delimiter: bytes | None, is_counted: bool) -> bytes:
-    """Write x, y, z and every numeric attribute; their names stand above if there are any."""
-    columns: dict[str, npt.NDArray[Any]] = {axis: cloud.xyz[:, index] for index, axis in enumerate(AXES)}
-    columns |= scalar_columns(cloud.attributes, _TYPES, taken=AXES)
-    separator = " " if delimiter is None else delimiter.decode()
-    lines: list[str] = [str(len(cloud))] if is_counted else []
-    if len(columns) > 3:
-        lines.append(("# " if delimiter is None else "") + separator.join(columns))
-    lines += map(separator.join, zip(*(_texts(values) for values in columns.values()), strict=True))
+def _axes(cloud: PointCloud) -> dict[str, npt.NDArray[Any]]:
+    return {axis: cloud.xyz[:, index] for index, axis in enumerate(AXES)}
+
+
+def _pts_columns(attributes: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return what a .pts file has of attributes, their colour in 8 bits where it can be: see _PTS_COLUMNS."""
+    columns = scalar_columns({n: attributes[n] for n in _PTS_COLUMNS[7] if n in attributes}, _TYPES, taken=AXES)
+    if not all(name in columns and columns[name].dtype.str[1:] in ("u1", "u2") for name in RGB):
+        return {name: columns[name] for name in ("intensity",) if name in columns}
+    intensity = columns.get("intensity", np.zeros(len(columns["red"]), np.uint8))
+    rgb = {name: columns[name] >> 8 if columns[name].itemsize > 1 else columns[name] for name in RGB}
+    return {"intensity": intensity, **rgb}
+
+
+def _lines(above: list[str], columns: dict[str, npt.NDArray[Any]], separator: str) -> bytes:
+    rows = map(separator.join, zip(*(_texts(values) for values in columns.values()), strict=True))
+    lines = [*above, *rows]
     return "\n".join([*lines, ""]).encode() if lines else b""
 
 

@@ -81,6 +81,16 @@ def test_exit_codes(arguments: list[str], code: int, text: str, scan: Path, monk
     assert text in done.stderr
 
 
+def test_a_result_that_could_not_be_written_is_refused_before_anything_is_filtered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("straightpcf.model.filter.Run", lambda *_: pytest.fail("it is filtered"))
+    np.save(cloud := tmp_path / "a.npy", np.vstack([noisy(torus(POINTS), 0.01), np.full((1, 3), np.nan)]))
+    done = CliRunner().invoke(app, ["denoise", str(cloud), str(tmp_path / "b.las"), "--device", "cpu"])
+    assert (done.exit_code, done.stderr.split(":")[0]) == (3, "error [unsupported_cloud]")
+    assert f"point {POINTS} is" in done.stderr
+
+
 def test_every_error_has_an_exit_code() -> None:
     codes = {exit_code(kind("x")) for kind in ERRORS_BY_CODE.values()}
     assert codes <= {2, 3, 4, 5, 70, 130}
@@ -172,6 +182,23 @@ def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None
         assert done.returncode == 0, done.stderr
     rows = (run / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "arguments", "code", "text"),
+    [
+        ({"a": torus(1500)}, [], 3, "malformed_file"),
+        ({"a/1": torus(500)}, [], 3, "too_few_points"),
+        ({"a/1": torus(1500)}, ["--device", "cuda:99"], 4, "device_unavailable"),
+    ],
+)
+def test_training_refuses_what_it_cannot_use_by_code(
+    arrays: dict[str, np.ndarray], arguments: list[str], code: int, text: str, tmp_path: Path
+) -> None:
+    np.savez(data := tmp_path / "shapes.npz", **arrays)
+    command = ["train", "vm", "--data", str(data), "--run-dir", str(tmp_path / "run"), *arguments]
+    done = CliRunner().invoke(app, command)
+    assert (done.exit_code, text in done.stderr) == (code, True), done.stderr
 
 
 def test_a_stage_without_the_one_before_is_a_usage_error(tmp_path: Path) -> None:

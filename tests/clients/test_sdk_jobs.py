@@ -46,6 +46,15 @@ def client(url: str) -> Iterator[Client]:
         yield client
 
 
+def test_a_name_may_be_a_path_and_need_not_be_utf_8(client: Client, tmp_path: Path) -> None:
+    (path := tmp_path / "sc\udce4n.xyz").write_text("\n".join(f"{x} {y} {z}" for x, y, z in SMALL))
+    job = client.jobs.create(path, iterations=1)
+    assert job.info.name == "sc?n.xyz"
+    named = client.denoise(path.read_bytes(), iterations=1, name=Path("s.xyz"))
+    np.testing.assert_array_equal(client.denoise(path, iterations=1).xyz, named.xyz)
+    job.delete()
+
+
 def test_a_job_goes_from_create_to_result(client: Client, tmp_path: Path) -> None:
     job = client.jobs.create(SMALL, iterations=1)
     info = job.wait()

@@ -13,7 +13,7 @@ import pytest
 from straightpcf.points.formats import read_cloud
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
-from tests.points.test_xyz import TABLES
+from tests.points.test_xyz import MALFORMED, TABLES
 from tests.waiting import wait_for
 
 POINTS = 2500
@@ -190,6 +190,14 @@ def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
     read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
     for case, raw in TABLES.items():
         assert page.evaluate(read, list(raw)) == [1, 2, 3, 4, 5, 6], case
+
+
+def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
+    """Rather no picture of what was sent than one of other columns."""
+    read = "async (b) => (await import('/static/read/xyz.js')).readXyz(new Uint8Array(b))"
+    said = "async (b) => { try { await (%s)(b) } catch (error) { return error.message } }" % read  # noqa: UP031
+    for case in (case for case, (_, pattern) in MALFORMED.items() if "name" in pattern):
+        assert page.evaluate(said, list(MALFORMED[case][0])) == "names that do not say x, y, z", case
 
 
 def _is_fault(said: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch,
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision
 from straightpcf.model.turns import turns
+from straightpcf.points.errors import InvalidCloud, MalformedFile, TooFewPoints
 from tests.clouds import sphere
 
 
@@ -216,3 +218,42 @@ def test_random_rotations_are_rotations() -> None:
     turn = random_rotations(50, torch.device("cpu"))
     torch.testing.assert_close(turn @ turn.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(turn), torch.ones(50))
+
+
+ARCHIVES: dict[str, tuple[dict[str, Any], type[InvalidCloud], str]] = {
+    "no slash": ({"a": sphere(PATCH_SIZE)}, MalformedFile, "'a'; it must be <shape>/<resolution>"),
+    "two slashes": ({"a/b/c": sphere(PATCH_SIZE)}, MalformedFile, "'a/b/c'; it must be"),
+    "few points": ({"a/1": sphere(PATCH_SIZE - 1)}, TooFewPoints, "a/1 has 999 points; a training patch has 1000"),
+    "two columns": ({"a/1": sphere(PATCH_SIZE)[:, :2]}, MalformedFile, r"a/1 is float64 \(1000, 2\)"),
+    "whole numbers": ({"a/1": np.ones((PATCH_SIZE, 3), int)}, MalformedFile, "a/1 is int64"),
+    "NaN": ({"a/1": np.full((PATCH_SIZE, 3), np.nan)}, MalformedFile, "a/1 holds NaN or infinity"),
+    "objects": ({"a/1": np.array([None] * 3)}, MalformedFile, "cannot be read as NPZ"),
+    "a place of beams": ({"a/eye": np.zeros((2, 3))}, MalformedFile, r"a/eye is float64 \(2, 3\); it must be \(3,\)"),
+    "normals of others": (
+        {"a/1": sphere(PATCH_SIZE), "a/normals": sphere(7)},
+        MalformedFile,
+        "a/normals has 7 rows for 1000 points",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ARCHIVES)
+def test_an_archive_that_cannot_be_trained_on_is_refused_by_file_and_name(case: str, tmp_path: Path) -> None:
+    arrays, error, message = ARCHIVES[case]
+    np.savez(path := tmp_path / "shapes.npz", **arrays)
+    with pytest.raises(error, match=f"shapes.npz.*{message}"):
+        PatchSource.read(path)
+
+
+def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", sphere(PATCH_SIZE))
+    (tmp_path / "a.npz").write_text("1 2 3")
+    np.savez(tmp_path / "cut.npz", **{"a/1": sphere(PATCH_SIZE)})
+    whole = bytearray((tmp_path / "cut.npz").read_bytes())
+    whole[1000] ^= 1
+    (tmp_path / "cut.npz").write_bytes(whole)
+    for name in ("a.npy", "a.npz", "cut.npz"):
+        with pytest.raises(MalformedFile, match=f"{name}.*NPZ"):
+            PatchSource.read(tmp_path / name)
+    with pytest.raises(FileNotFoundError):
+        PatchSource.read(tmp_path / "none.npz")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -73,3 +74,37 @@ def test_columns_of_text_faces_and_records_are_named(tmp_path: Path) -> None:
     colours = PointCloud(torus(2), {"red": np.arange(2, dtype=np.uint8), "intensity": np.ones(2, np.float32)})
     assert format_named("kitti").left_behind(colours) == ["red"]
     assert format_named("npy").left_behind(colours) == ["red", "intensity"]
+
+
+MANY = {f"column_{column}": np.zeros(9) for column in range(400)}
+NOT_FINITE = np.where(np.arange(27) == 5, np.nan, torus(9).ravel()).reshape(9, 3)
+CLOUDS = {
+    "plain": PointCloud(torus(9)),
+    "NaN": PointCloud(NOT_FINITE),
+    "huge": PointCloud(torus(9) * 1e200),
+    "UTM": PointCloud(torus(9) + 5e6),
+    "many attributes": PointCloud(torus(9), MANY),
+    "an intensity beyond float32": PointCloud(torus(9), {"intensity": np.full(9, 1e300)}),
+    "no points": PointCloud(np.empty((0, 3))),
+}
+
+
+@pytest.mark.parametrize("target", FORMATS, ids=lambda format: format.name)
+@pytest.mark.parametrize("case", CLOUDS)
+def test_a_cloud_that_cannot_be_written_is_refused_by_the_check_already(
+    case: str, target: Format, tmp_path: Path
+) -> None:
+    try:
+        write_cloud(CLOUDS[case], tmp_path / "out", target)
+    except (MissingDependency, UnsupportedCloud) as refused:
+        with pytest.raises(type(refused), match=re.escape(refused.message)):
+            target.check(CLOUDS[case])
+    else:
+        target.check(CLOUDS[case])
+
+
+def test_the_check_looks_for_what_packs_laz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    format_named("las").check(CLOUDS["plain"])
+    with pytest.raises(MissingDependency, match=r"pip install 'straightpcf\[las\]'"):
+        format_named("laz").check(CLOUDS["plain"])

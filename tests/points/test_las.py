@@ -6,8 +6,10 @@ import struct
 import sys
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from straightpcf.points.cloud import PointCloud
@@ -65,6 +67,13 @@ def test_what_lazrs_cannot_pack_without_loss_is_refused_as_laz_and_kept_as_las(
     write_cloud(cloud.with_xyz(middle), tmp_path / "b.las", las)
     again, _ = read_cloud(tmp_path / "b.las")
     assert all(again.attributes[n].tobytes() == v.tobytes() for n, v in cloud.attributes.items())
+
+
+def test_points_that_have_no_packing_are_refused_by_the_check(tmp_path: Path) -> None:
+    cloud, _ = read_cloud(_waveform_file(tmp_path / "a.las", 4, is_noise=False))
+    format_named("las").check(cloud)
+    with pytest.raises(UnsupportedCloud, match="format 4 cannot be packed as LAZ; write LAS"):
+        format_named("laz").check(cloud)
 
 
 def test_points_that_come_out_of_lazrs_changed_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,3 +140,60 @@ def test_attributes_whose_long_names_begin_alike_all_come_back(tmp_path: Path) -
         np.testing.assert_array_equal(values, expected)
     theirs = laspy.read(path)
     assert len(set(theirs.point_format.extra_dimension_names)) == 12
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_attributes_with_names_of_dimensions_are_put_there_or_beside_them(suffix: str, tmp_path: Path) -> None:
+    """laspy opens no file in which an extra dimension is called as a standard one, bit fields included."""
+    held: dict[str, npt.NDArray[Any]] = {
+        "intensity": np.arange(N, dtype=np.float32) * 1300,
+        "return_number": np.arange(N) % 8,
+        "number_of_returns": np.full(N, 7, np.uint8),
+        "classification": np.arange(N) % 32.0,
+        "withheld": np.arange(N) % 2 == 1,
+        "scan_angle_rank": np.arange(N, dtype=np.int16) - 90,
+        "point_source_id": np.arange(N, dtype=np.uint32),
+        "gps_time": np.linspace(0, 1, N, dtype=np.float32),
+    }
+    beside: dict[str, npt.NDArray[Any]] = {
+        "user_data": np.arange(N) * 100.0,
+        "key_point": np.full(N, 2, np.uint8),
+        "synthetic": np.linspace(0, 1, N),
+        "bit_fields": np.arange(N, dtype=np.uint8),
+    }
+    write_cloud(PointCloud(torus(N), held | beside), tmp_path / f"a.{suffix}", format_named(suffix))
+    theirs = laspy.read(tmp_path / f"a.{suffix}")
+    for name, values in held.items():
+        np.testing.assert_array_equal(theirs[name], values.astype(np.float64), name)
+    for name, values in beside.items():
+        np.testing.assert_array_equal(theirs[f"extra_{name}"], values, name)
+    assert not any(np.any(theirs[name]) for name in ("user_data", "key_point", "synthetic"))
+
+
+def test_intensity_that_is_no_whole_number_stays_what_it_is(tmp_path: Path) -> None:
+    """A KITTI frame's is in 0..1, and a table may hold `extra_intensity`, too."""
+    attributes = {"intensity": np.linspace(0, 1, N, dtype=np.float32), "extra_intensity": np.arange(N)}
+    write_cloud(PointCloud(torus(N), attributes), path := tmp_path / "a.las", format_named("las"))
+    theirs = laspy.read(path)
+    np.testing.assert_array_equal(theirs["extra_extra_intensity"], attributes["intensity"])
+    np.testing.assert_array_equal(theirs["extra_intensity"], attributes["extra_intensity"])
+
+
+def test_extra_bytes_are_read_with_their_scale_and_offset_and_kept_as_they_are(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=0)
+    header.add_extra_dim(laspy.ExtraBytesParams("Amplitude", "u2", scales=np.array([0.01]), offsets=np.array([0.0])))
+    header.add_extra_dim(laspy.ExtraBytesParams("Deviation", "i4", scales=np.array([0.5]), offsets=np.array([-3.0])))
+    header.add_extra_dim(laspy.ExtraBytesParams("plain", "u2"))
+    theirs = laspy.LasData(header)
+    theirs.x, theirs.y, theirs.z = torus(N).T
+    theirs.Amplitude, theirs.Deviation, theirs.plain = np.arange(N) * 0.25, np.arange(N) - 3.5, np.arange(N)
+    theirs.write(tmp_path / "a.las")
+    cloud, las = read_cloud(tmp_path / "a.las")
+    np.testing.assert_allclose(cloud.attributes["Amplitude"], np.arange(N) * 0.25, atol=1e-12)
+    np.testing.assert_array_equal(cloud.attributes["Deviation"], np.arange(N) - 3.5)
+    assert cloud.attributes["plain"].dtype == np.uint16
+    write_cloud(cloud.with_xyz(cloud.xyz + 1), tmp_path / "b.las", las)
+    again = laspy.read(tmp_path / "b.las")
+    np.testing.assert_array_equal(again.points.array["Amplitude"], theirs.points.array["Amplitude"])
+    write_cloud(cloud, tmp_path / "a.ply", format_named("ply"))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.ply")[0].attributes["Amplitude"], np.arange(N) * 0.25)

@@ -173,3 +173,29 @@ def test_a_member_that_lies_about_its_size_is_malformed(tmp_path: Path) -> None:
     raw[at + 24 : at + 28] = (10**9).to_bytes(4, "little")
     with pytest.raises(InvalidCloud):
         read(tmp_path, bytes(raw))
+
+
+@pytest.mark.parametrize(("members", "shape"), [(1, (1000, 10_000)), (3, (1000, 4000))])
+def test_arrays_far_beyond_the_points_stay_packed_and_are_kept(
+    members: int, shape: tuple[int, int], tmp_path: Path
+) -> None:
+    """Zeros pack a thousand to one: less than a megabyte would be hundreds in memory."""
+    with zipfile.ZipFile(path := tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", npy(torus(1000)))
+        archive.writestr("label.npy", npy(np.arange(1000)))
+        for member in range(members):
+            with archive.open(f"extra_{member}.npy", "w") as file:
+                header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(file, header)
+                for _ in range(100):
+                    file.write(bytes(8 * shape[0] * shape[1] // 100))
+    tracemalloc.start()
+    cloud, npz_format = read_cloud(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 16 << 20
+    assert list(cloud.attributes) == ["label"]
+    assert cloud.beside == tuple(f"extra_{member}.npy" for member in range(members))
+    write_cloud(cloud.with_xyz(cloud.xyz + 1), after := tmp_path / "b.npz", npz_format)
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(after) as new:
+        assert [(m.filename, m.CRC) for m in old.infolist()[1:]] == [(m.filename, m.CRC) for m in new.infolist()[1:]]

@@ -39,6 +39,17 @@ TABLES = {
     "surveyors' names": b"id;Northing;Easting;Height\nA;2;1;3\nB;5;4;6\n",
     "names with units": b"t [s],X [m],Y (m),Z [m]\n7,1,2,3\n8,4,5,6\n",
     "names with gaps and twins": b"id,x,y,z,w,w,\n7,1,2,3,8,9,\n7,4,5,6,8,9,\n",
+    "names in a comment above another": b"# id x y z\n# written by me\n7 1 2 3\n8 4 5 6\n",
+    "names in a comment above an empty one": b"# id x y z\n#\n7 1 2 3\n8 4 5 6\n",
+    "names in a comment above a count": b"// id x y z\n2\n7 1 2 3\n8 4 5 6\n",
+    "names behind a word": b"# columns: id x y z\n7 1 2 3\n8 4 5 6\n",
+    "names between tabs": b"Point Id\tX\tY\tZ\n7\t1\t2\t3\n8\t4\t5\t6\n",
+    "names with units between spaces": b"id x [m] y [m] z [m]\n7 1 2 3\n8 4 5 6\n",
+    "MATLAB's comment": b"%id x y z\n7 1 2 3\n8 4 5 6\n",
+    "names that begin with digits": b"1st,x,y,z\n7,1,2,3\n8,4,5,6\n",
+    "a delimiter behind the cells": b"id,x,y,z\n7,1,2,3,\n8,4,5,6,\n",
+    "a name twice in a comment": b"# x x y z\n1 2 3 7\n4 5 6 8\n",
+    "names that are no ASCII": "# n\u00e0me id x y z\n7 8 1 2 3\n7 8 4 5 6\n".encode(),
     "three names of any kind": b"a,b,c\n1,2,3\n4,5,6\n",
     "a remark of as many words": b"# made by a program\n1 2 3 7\n4 5 6 8\n",
     "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
@@ -94,6 +105,39 @@ def test_a_remark_that_is_no_title_of_the_table_changes_nothing(remark: bytes, t
     np.testing.assert_array_equal(read(tmp_path, remark + b"\n1 2 3 4 5 6\n").xyz, [[1, 2, 3]])
 
 
+@pytest.mark.parametrize(
+    "token",
+    [
+        b"nan(ind)",
+        b"-nan(ind)",
+        b"-nan(snan)",
+        b"-1.#IND",
+        b"-1.#IND00",
+        b"1.#QNAN0",
+        b"1.#SNAN",
+        b"1.#INF",
+        b"-1.#INF00",
+    ],
+)
+def test_what_microsofts_runtimes_print_is_no_number_but_no_name_either(token: bytes, tmp_path: Path) -> None:
+    """The first row of three such words is none of names, and every token stays as it stands."""
+    rows = b"%b %b %b\r\n1 2 3\r\n4 5 %b\r\n" % (token, token, token, token)
+    expected = float(token[: token.index(b"1")] + b"inf") if b"INF" in token else np.nan
+    cloud = read(tmp_path, rows)
+    np.testing.assert_array_equal(cloud.xyz, [[expected] * 3, [1, 2, 3], [4, 5, expected]])
+    moved = cloud.xyz + np.array([0.0, 0.5, 0.0])
+    assert written(tmp_path, cloud.with_xyz(moved)) == rows.replace(b"1 2 3", b"1 2.5 3").replace(b"4 5 ", b"4 5.5 ")
+    ascii_ply = b"ply\nformat ascii 1.0\nelement vertex 3\n"
+    ascii_ply += b"".join(b"property float %c\n" % axis for axis in b"xyz") + b"end_header\n" + rows
+    np.testing.assert_array_equal(read(tmp_path, ascii_ply, "a.ply").xyz, cloud.xyz)
+
+
+@pytest.mark.parametrize("token", [b"nan(", b"1.#", b"1.#INF5", b"nan(0)5", b"d", b"s(1)"])
+def test_what_only_looks_like_it_is_refused(token: bytes, tmp_path: Path) -> None:
+    with pytest.raises(MalformedFile, match="no number"):
+        read(tmp_path, b"1 2 3\n4 5 " + token + b"\n")
+
+
 def test_nan_and_infinite_positions_are_read_and_kept(tmp_path: Path) -> None:
     raw = b"nan NaN -nan\ninf -Inf 1e5\n1 2 3\n"
     cloud = read(tmp_path, raw)
@@ -113,8 +157,7 @@ def test_a_new_table_names_its_columns(tmp_path: Path) -> None:
     assert written(tmp_path, cloud).startswith(b"# x y z scan_id w\n")
     assert b" 2 0.1\n" in written(tmp_path, cloud)
     assert written(tmp_path, cloud, "out.csv").startswith(b"x,y,z,scan_id,w\n")
-    assert written(tmp_path, cloud, "out.pts").startswith(b"3\n# x")
-    for name in ("out.xyz", "out.csv", "out.pts"):
+    for name in ("out.xyz", "out.csv"):
         again = read_cloud(tmp_path / name)[0]
         np.testing.assert_array_equal(again.xyz, cloud.xyz)
         assert list(again.attributes) == ["scan_id", "w"]
@@ -126,7 +169,7 @@ def test_a_new_table_names_its_columns(tmp_path: Path) -> None:
         ("a.xyz", b"1 2 3 7\n4 5.50 6 0.5\n", "csv", b"x,y,z,column_4\n1,2,3,7\n4,5.5,6,0.5\n"),
         ("a.xyz", b"# made\n1 2 3\n4 5 6\n", "pts", b"2\n1 2 3\n4 5 6\n"),
         ("a.csv", b"z,y,x,id\n3,2,1,tree\n6,5,4,house\n", "xyz", b"1 2 3\n4 5 6\n"),
-        ("a.pts", b"1\n1 2 3 9\n", "xyz", b"# x y z column_4\n1 2 3 9\n"),
+        ("a.pts", b"1\n1 2 3 9\n", "xyz", b"# x y z intensity\n1 2 3 9\n"),
         ("a.txt", b"X,Y,Z\n1.00, 2,3\n", "csv", b"X,Y,Z\n1.00, 2,3\n"),  # it has the layout
         ("a.csv", b"1;2.0;3\n", "csv", b"1;2.0;3\n"),  # nothing else was asked for
         ("a.asc", b"2\n1 2 3.0 x\n4 5 6 y\n", "pts", b"2\n1 2 3.0 x\n4 5 6 y\n"),
