@@ -33,7 +33,17 @@ from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, TooFewPoints
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
-__all__ = ["DEFAULT_WEIGHTS", "MIN_POINTS", "DenoiseResult", "Filter", "FinishedPatch", "Run", "denoise", "load_filter"]
+__all__ = [
+    "DEFAULT_WEIGHTS",
+    "MIN_POINTS",
+    "DenoiseResult",
+    "Filter",
+    "FinishedPatch",
+    "Run",
+    "denoise",
+    "device_named",
+    "load_filter",
+]
 
 DEFAULT_WEIGHTS = Path(__file__).with_name("weights") / "straightpcf.safetensors"
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
@@ -91,14 +101,15 @@ def load_filter(
     threads: CPU threads, all cores by default; the result does not depend on it. tile_points: see Filter. Raises
     DeviceUnavailable for a device that is not here, MalformedFile for weights that do not fit, InvalidOptions.
     """
-    chosen = _device(device)
+    chosen = device_named(device)
     path = DEFAULT_WEIGHTS if weights is None else weights
     network = load_checkpoint(path, device=chosen)
     calibration = Calibration.from_metadata(read_checkpoint(path)[1])
     return Filter(network, calibration=calibration, device=chosen, threads=threads, tile_points=tile_points)
 
 
-def _device(name: str) -> str:
+def device_named(name: str) -> str:
+    """Return "cpu", "cuda" or "cuda:N" for that or "auto"; raises DeviceUnavailable for what is not here."""
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name):
         raise DeviceUnavailable(f'device is {name[:40]!r}; it must be "auto", "cpu", "cuda" or "cuda:N"')
     here = torch.cuda.device_count() if name != "cpu" else 0

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from straightpcf.model.allocator import keep_large_buffers
-from straightpcf.model.filter import _device
+from straightpcf.model.filter import device_named
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
@@ -93,7 +93,7 @@ def train(
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
     if passed and stage != "cvm":
         raise InvalidOptions(f"clouds after passes are for stage 'cvm', not for {stage!r}")
-    place = torch.device(_device(device))
+    place = torch.device(device_named(device))
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)

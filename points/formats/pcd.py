@@ -23,6 +23,7 @@ from straightpcf.points.formats.text import as_integers, as_numbers, blocks, ref
 __all__ = ["Pcd"]
 
 _NORMAL_FIELDS = frozenset(name for names in NORMALS for name in names)
+_MOST_LOST = 1e-6  # of a new file's extent, by float positions; those of an object or a frame lose 1e-7
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 
 
@@ -202,9 +203,21 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
     return PointCloud(xyz, _attributes(found), source)
 
 
+def _position_type(xyz: npt.NDArray[np.float64]) -> str:
+    """Choose float, the only one that PCL's point types and Open3D take, where it holds (N, 3) well; else double."""
+    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(finite):
+        return "<f4"
+    with np.errstate(over="ignore"):
+        lost = np.abs(finite.astype("<f4") - finite).max()
+    half = (finite.max(axis=0) / 2 - finite.min(axis=0) / 2).max()  # halves: a difference may overflow
+    return "<f4" if lost / 2 <= _MOST_LOST * half else "<f8"
+
+
 def _new_file(cloud: PointCloud) -> bytes:
-    """Write a binary file with double positions and every attribute as fields of one value."""
-    columns = {axis: cloud.xyz[:, column].astype("<f8") for column, axis in enumerate(AXES)}
+    """Write a binary file with positions and every attribute as fields of one value."""
+    kind = _position_type(cloud.xyz)
+    columns = {axis: cloud.xyz[:, column].astype(kind) for column, axis in enumerate(AXES)}
     columns |= scalar_columns(packed(cloud.new_attributes()), _TYPES, taken=AXES)
     table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():

@@ -14,7 +14,7 @@ from straightpcf.points.formats import FORMATS, Format, format_for, format_named
 from tests.points.samples import SAMPLES, N, plain_cloud
 
 SCANS = Path(__file__).parents[2].parent / "shared" / "data" / "scans"
-TOLERANCE = {"las": 1e-3, "laz": 1e-3, "kitti": 1e-6}
+TOLERANCE = {"las": 1e-3, "laz": 1e-3, "kitti": 1e-6, "pcd": 1e-6}
 every_format = pytest.mark.parametrize("format", FORMATS, ids=lambda format: format.name)
 
 

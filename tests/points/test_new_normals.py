@@ -44,7 +44,7 @@ def pcd(tmp_path: Path, encoding: str) -> bytes:
     if encoding == "binary":
         return raw
     head, body = raw.split(b"DATA binary\n")
-    table = np.frombuffer(body, [(name, "<f8") for name in "xyz"] + [(name, "<f4") for name in names] + [("red", "u1")])
+    table = np.frombuffer(body, [(name, "<f4") for name in (*"xyz", *names)] + [("red", "u1")])
     if encoding == "ascii":
         return head + b"DATA ascii\n" + "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode() + b"\n"
     from straightpcf.points.formats import lzf

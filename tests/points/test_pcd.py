@@ -31,6 +31,14 @@ def _written(folder: Path, cloud: PointCloud) -> bytes:
     return out.read_bytes()
 
 
+@pytest.mark.parametrize(("offset", "size"), [(0.0, 4), (500_000.0, 8)])
+def test_a_new_file_has_float_positions_where_they_hold_the_cloud(offset: float, size: int, tmp_path: Path) -> None:
+    xyz = torus(100) + offset
+    write_cloud(PointCloud(xyz), out := tmp_path / "new.pcd", format_named("pcd"))
+    assert f"SIZE {size} {size} {size}\n".encode() in out.read_bytes()
+    np.testing.assert_allclose(read_cloud(out)[0].xyz, xyz, rtol=0, atol=1e-6)
+
+
 def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None:
     raw = HEADER + b"\n1 2 3 7\n\n \t\n4 5 6 8\r\n\r\nnan nan nan 9\n\nrest"
     cloud = _read(tmp_path, raw)
