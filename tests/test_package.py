@@ -24,6 +24,7 @@ PUBLIC = {
         "FinishedPatch",
         "Run",
         "denoise",
+        "device_named",
         "load_filter",
     ],
     "straightpcf.model.metrics": ["chamfer_distance", "point_to_mesh_distance", "unit_sphere"],
