@@ -26,7 +26,7 @@ _SCATTERED, _TELLING = 0.25, 0.6
 # cells of 1 : 2.5 and more, and by chance.
 _LINED = 1.3
 _LEAST = 100  # points of a patch; of fewer a third have the nearest 32 in common
-_NEAREST = 100  # what the looks ask for
+_NEAREST = 64  # what the looks ask for
 _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, at most, and of all where they are few
 
 

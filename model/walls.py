@@ -109,8 +109,8 @@ class _Shape:
 
 
 def between_walls(near: Nearest) -> list[bool]:
-    """Say whether points of a patch may be on walls close together, by their nearest 24, 64 and 100."""
-    return [_Heights.of(near.first(count)).are_walls(_MAY_BE_FEW) for count in _AROUND]
+    """Say whether points of a patch may be on walls close together, by their nearest 24 and 64."""
+    return [_Heights.of(near.first(count)).are_walls(_MAY_BE_FEW) for count in _AROUND[:2]]
 
 
 def has_walls(found: Sequence[Sequence[bool]]) -> bool:
