@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -71,12 +71,10 @@ class JobFolders:
         """Remove a job's files."""
         shutil.rmtree(self.path(folder), ignore_errors=True)
 
-    def remove_all_but_input(self, folder: str) -> None:
-        """Remove what earlier attempts at a job wrote; one that still writes has its files to itself."""
-        with suppress(FileNotFoundError):  # it may be removed meanwhile
-            for path in self.path(folder).iterdir():
-                if path.name != INPUT:
-                    path.unlink(missing_ok=True)
+    def remove_files(self, folder: str, names: Iterable[str]) -> None:
+        """Remove some of a job's files, where they are there."""
+        for name in names:
+            (self.path(folder) / name).unlink(missing_ok=True)
 
     def job_bytes(self, folder: str) -> int:
         """Return how large a job's files are."""

@@ -131,17 +131,19 @@ class JobRunner:
         folder = self._folders.path(record.folder)
         log = _Log(claim, self._call, self._notify)
         try:
-            await asyncio.to_thread(self._folders.remove_all_but_input, record.folder)
+            # Earlier ones' alone: one that was held up here, and whose job is another's by now, harms no later one.
+            earlier = [name(attempt) for attempt in range(1, record.attempts) for name in (_patches, _target)]
+            await asyncio.to_thread(self._folders.remove_files, record.folder, earlier)
             return await self._backend.run(
                 FileJob(
                     id=record.id,
                     source=folder / INPUT,
-                    target=folder / _target(claim),
+                    target=folder / _target(record.attempts),
                     options=record.options,
                     max_points=self._max_points,
                     name=record.name,
                     format=record.format,
-                    patches=folder / f"patches-{record.attempts}",
+                    patches=folder / _patches(record.attempts),
                 ),
                 log,
             )
@@ -193,7 +195,7 @@ class JobRunner:
         )  # fmt: skip
         await self._call(
             JobStore.succeed, record.id, claim.fence, result=_result_info(record.name, report),
-            report=_report(report), file=_target(claim), expires_in=self._ttl,
+            report=_report(report), file=_target(record.attempts), expires_in=self._ttl,
         )  # fmt: skip
 
     async def _after_cancel(self, claim: Claim, reason: Reason | None) -> None:
@@ -275,9 +277,13 @@ class _Log:
             self._notify(self._id)
 
 
-def _target(claim: Claim) -> str:
+def _target(attempt: int) -> str:
     """Name an attempt's own result: one that comes back from the dead harms no later one."""
-    return f"result-{claim.record.attempts}"
+    return f"result-{attempt}"
+
+
+def _patches(attempt: int) -> str:
+    return f"patches-{attempt}"
 
 
 def _trace(claim: Claim) -> str:

@@ -45,12 +45,13 @@ def test_what_earlier_attempts_wrote_is_removed_when_the_next_begins(tmp_path: P
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         record, _ = await submit(engine)
         folder = tmp_path / "jobs" / record.folder
-        for name in ("patches-1", "result-1"):  # of a server that died
+        # Of a server that died; and of a later attempt, where this one was held up and its job is another's by now.
+        for name in ("patches-1", "result-1", "result-3"):
             (folder / name).write_bytes(b"x")
         backend.go.set()
         backend.finish.set()
         await engine.wait(record.id)
-        assert sorted(path.name for path in folder.iterdir()) == ["input", "patches-2", "result-2"]
+        assert sorted(path.name for path in folder.iterdir()) == ["input", "patches-2", "result-2", "result-3"]
 
     play(tmp_path, scenario, WorkerDied("killed"))
 
