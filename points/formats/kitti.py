@@ -11,7 +11,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
-from straightpcf.points.formats.positions import AXES, narrowed, put_positions, widened
+from straightpcf.points.formats.positions import AXES, narrowed, put_positions, rounding, widened
 
 __all__ = ["Kitti"]
 
@@ -91,12 +91,7 @@ def _has_intensity(cloud: PointCloud) -> bool:
 
 def _check_rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[np.float32]) -> None:
     """Refuse positions (N, 3) that lie so far out beside their extent that float32 tells neighbours no more apart."""
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.any():
-        return
-    here = xyz[finite]
-    half = float((here.max(axis=0) / 2 - here.min(axis=0) / 2).max())  # halves: a difference may overflow
-    lost = float(np.abs(stored[finite] - here).max())
+    lost, half = rounding(xyz, stored)
     if lost / 2 > _MOST_LOST * half:
         raise UnsupportedCloud(
             f"rounded to float32, as a KITTI frame has them, positions would be up to {lost:.3g} off, more than "

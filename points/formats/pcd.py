@@ -16,7 +16,7 @@ from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import PcdHeader, read_header
-from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, widened
+from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
@@ -205,12 +205,8 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
 
 def _position_type(xyz: npt.NDArray[np.float64]) -> str:
     """Choose float, the only one that PCL's point types and Open3D take, where it holds (N, 3) well; else double."""
-    finite = xyz[np.isfinite(xyz).all(axis=1)]
-    if not len(finite):
-        return "<f4"
-    with np.errstate(over="ignore"):
-        lost = np.abs(finite.astype("<f4") - finite).max()
-    half = (finite.max(axis=0) / 2 - finite.min(axis=0) / 2).max()  # halves: a difference may overflow
+    with np.errstate(over="ignore", invalid="ignore"):
+        lost, half = rounding(xyz, xyz.astype("<f4"))
     return "<f4" if lost / 2 <= _MOST_LOST * half else "<f8"
 
 

@@ -11,7 +11,18 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 
-__all__ = ["AXES", "changes", "gathered", "moved", "narrowed", "number_text", "put_positions", "scattered", "widened"]
+__all__ = [
+    "AXES",
+    "changes",
+    "gathered",
+    "moved",
+    "narrowed",
+    "number_text",
+    "put_positions",
+    "rounding",
+    "scattered",
+    "widened",
+]
 
 AXES = "xyz"
 
@@ -50,6 +61,16 @@ def narrowed(values: npt.NDArray[np.float64], dtype: np.dtype[Any], *, what: str
     if lost.any():
         raise UnsupportedCloud(f"{what} {values[lost][0]:g} does not fit into {dtype.name}, which the file declares")
     return stored
+
+
+def rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[Any]) -> tuple[float, float]:
+    """Return by how much positions (N, 3) are stored wrong at most, and half of their extent; of finite ones."""
+    finite = np.isfinite(xyz).all(axis=1)
+    if not finite.any():
+        return 0.0, 0.0
+    here = xyz[finite]
+    half = float((here.max(axis=0) / 2 - here.min(axis=0) / 2).max())  # halves: a difference may overflow
+    return float(np.abs(stored[finite] - here).max()), half
 
 
 def put_positions(
