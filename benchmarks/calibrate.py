@@ -27,7 +27,7 @@ from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, no
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
 
 # The table is read of every fifth shape's 50K points: with 3 % of noise d is lower there than at 10K, and noise read
-# too low costs more than noise read too high (docs/training.md).
+# too low costs more than noise read too high (docs/filter.md).
 _TABLE_CLOUDS, _TABLE_EVERY = "50000", 5
 
 
