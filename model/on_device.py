@@ -6,6 +6,7 @@ Written and tested on the CPU, where a captured graph is a function called again
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections import deque
@@ -43,12 +44,21 @@ def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], ob
     """Capture one run of a computation, which has run before, as a CUDA graph."""
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
     try:
-        # A stream of its own: torch's for captures belongs to the device of a process's first one.
-        with torch.cuda.graph(graph, stream=torch.cuda.Stream(), capture_error_mode="thread_local"):  # type: ignore[no-untyped-call]
+        side = _capture_stream(torch.cuda.current_device())
+        with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
             out = run()
     finally:
         torch.cuda.set_stream(stream)  # a capture that fails leaves its own current
     return graph.replay, out
+
+
+@functools.cache
+def _capture_stream(device: int) -> torch.cuda.Stream:
+    """Return the stream of a device on which all captures are made: cuBLAS keeps a workspace for every stream.
+
+    torch's own stream for captures is on the device of a process's first capture.
+    """
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 class Graphs:
