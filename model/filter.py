@@ -112,8 +112,7 @@ def device_named(name: str) -> str:
     """Return "cpu", "cuda" or "cuda:N" for that or "auto"; raises DeviceUnavailable for what is not here."""
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name):
         raise DeviceUnavailable(f'device is {name[:40]!r}; it must be "auto", "cpu", "cuda" or "cuda:N"')
-    # Where its driver is too old for this torch, a device is counted all the same.
-    here = torch.cuda.device_count() if name != "cpu" and torch.cuda.is_available() else 0
+    here = torch.cuda.device_count() if name != "cpu" and torch.cuda.is_available() else 0  # too old drivers count, too
     if name == "auto":
         return "cuda" if here else "cpu"
     number = int(name.partition(":")[2] or 0)

@@ -125,9 +125,7 @@ class Tiling:
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
 
 
-def _by_leaves(
-    xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]
-) -> list[npt.NDArray[np.int64]]:
+def _by_leaves(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]) -> list[npt.NDArray[np.int64]]:
     return [rows[cKDTree(xyz[rows]).indices] for rows in tiles]
 
 

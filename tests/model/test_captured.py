@@ -16,6 +16,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from straightpcf.model.kernels import cuda
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.on_device import OnDevice, _Held
+from straightpcf.model.patches import Patches
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
 from straightpcf.model.train.soap import SOAP
@@ -74,6 +76,28 @@ def test_the_network_of_a_pass_can_be_captured(*, read_before: bool) -> None:
     with torch.inference_mode(), OnCuda(), Captured():
         moved, _ = network(x, rows=384, owned=owned, distance=distance, turns=positions)
     assert moved.shape == (4, 384, 3)
+
+
+@pytest.mark.parametrize("probed", [{}, dict.fromkeys(range(40), 0.5)])
+def test_launching_a_batch_waits_for_nothing(probed: dict[int, float]) -> None:
+    network, captured = on_device().requires_grad_(requires_grad=False), []
+
+    def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        moved: torch.Tensor = network(x, rows=rows, owned=owned, distance=distance)[0]
+        return moved
+
+    def capture(run: Any) -> tuple[Any, torch.Tensor]:
+        captured.append(run)
+        return run, run()
+
+    rows, each = np.arange(40), np.ones(40)
+    cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
+    processor = OnDevice(forward, network.distance_module, "meta", batch=8, capture=capture)
+    points, held = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE), _Held.of(cut, each, probed, DEVICE)
+    with OnCuda(), Captured():
+        for first in range(0, 40, 8):
+            assert processor._launch(points, cut, held, range(first, first + 8)).shape[0] == 8
+    assert len(captured) == 2  # rows up to 128 and to 256 come twice, up to 384 once
 
 
 @pytest.mark.parametrize("loss", [velocity_loss, coupled_loss, distance_loss])
