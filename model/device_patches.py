@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.device import current, enough_memory
 from straightpcf.model.kernels import cuda
 from straightpcf.model.ops import squared_distances
 from straightpcf.model.patches import PATCH_SIZE, Patches
@@ -23,7 +24,15 @@ _DISTANCES = 2**26  # held at once: 256 MiB, and as much again while they are co
 def cut_patches_on(
     device: torch.device, xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE
 ) -> Patches:
-    """Do what `cut_patches` does, in float32: points (N, 3) in the unit ball, N below 2**31."""
+    """Do what `cut_patches` does, in float32: points (N, 3) in the unit ball, N below 2**31.
+
+    Raises TooLarge where the device has no memory for them.
+    """
+    with current(device), enough_memory(device, len(xyz)):
+        return _cut(device, xyz, coverage, seed, patch_size)
+
+
+def _cut(device: torch.device, xyz: npt.NDArray[np.float64], coverage: float, seed: int, patch_size: int) -> Patches:
     points = torch.from_numpy(xyz.astype(np.float32)).to(device)
     count = len(points)
     size = min(patch_size, count)

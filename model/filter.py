@@ -28,7 +28,7 @@ from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Processor
 from straightpcf.model.restraint import made_of, reaches
 from straightpcf.model.spacing import Lie
-from straightpcf.model.tiles import Tiling, parted, split
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, TooFewPoints
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
@@ -112,7 +112,7 @@ def device_named(name: str) -> str:
     """Return "cpu", "cuda" or "cuda:N" for that or "auto"; raises DeviceUnavailable for what is not here."""
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name):
         raise DeviceUnavailable(f'device is {name[:40]!r}; it must be "auto", "cpu", "cuda" or "cuda:N"')
-    here = torch.cuda.device_count() if name != "cpu" else 0
+    here = torch.cuda.device_count() if name != "cpu" and torch.cuda.is_available() else 0  # too old drivers count, too
     if name == "auto":
         return "cuda" if here else "cpu"
     number = int(name.partition(":")[2] or 0)
@@ -394,7 +394,7 @@ class Run:
             if count == 1:
                 yield from ((number, cut) for cut in tiling.cuts())
                 continue
-            for rows in parted(here, tiling.tiles, count):
+            for rows in tiling.parted(count):
                 yield from ((number, cut.of_rows(rows)) for cut in self._tiling(here[rows]).cuts())
 
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:

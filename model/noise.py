@@ -21,7 +21,7 @@ from straightpcf.model.normalize import (
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
 from straightpcf.model.spacing import Lie
-from straightpcf.model.tiles import Tiling, parted
+from straightpcf.model.tiles import Tiling
 
 __all__ = ["NoiseReader", "Reading"]
 
@@ -161,7 +161,7 @@ class NoiseReader:
 
     def _thinned(self, here: Floats, tiling: Tiling, zoom: float) -> Floats:
         """Return so few points that patches are as large as before where they are shown zoom times their size."""
-        return here[parted(here, tiling.tiles, _parts(here, zoom))[0]]
+        return here[tiling.parted(_parts(here, zoom))[0]]
 
     def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
         """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""

@@ -6,12 +6,12 @@ Written and tested on the CPU, where a captured graph is a function called again
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
 from straightpcf.model.processor import Each, Finish, Floats, Forward, cut_out
@@ -43,11 +44,21 @@ def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], ob
     """Capture one run of a computation, which has run before, as a CUDA graph."""
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
     try:
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        side = _capture_stream(torch.cuda.current_device())
+        with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
             out = run()
     finally:
         torch.cuda.set_stream(stream)  # a capture that fails leaves its own current
     return graph.replay, out
+
+
+@functools.cache
+def _capture_stream(device: int) -> torch.cuda.Stream:
+    """Return the stream of a device on which all captures are made: cuBLAS keeps a workspace for every stream.
+
+    torch's own stream for captures is on the device of a process's first capture.
+    """
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 class Graphs:
@@ -124,21 +135,17 @@ class OnDevice:
 
         Raises TooLarge where it has no memory for one patch.
         """
-        points, held = torch.from_numpy(here).to(self.device), _Held.of(cut, scales, probed, self.device)
+        points, held = self._sent(here, cut, scales, probed)
         waiting: deque[tuple[range, _Result]] = deque()
         first = 0
         while first < len(cut.seeds):
             chosen = range(first, min(first + self.batch, len(cut.seeds)))
             try:
-                with self._current():
+                with current(self.device):
                     moves = self._launch(points, cut, held, chosen)
                     waiting.append((chosen, _Result(moves[: len(chosen)])))
             except torch.OutOfMemoryError as exc:
-                if self.batch == 1:
-                    raise TooLarge(f"{self.device} has no memory for a patch of {cut.index.shape[1]} points") from exc
-                self.batch //= 2
-                self._graphs.clear()
-                torch.cuda.empty_cache()
+                self._halve(cut, exc)
                 continue
             first = chosen.stop
             if len(waiting) == _IN_FLIGHT:
@@ -148,38 +155,55 @@ class OnDevice:
 
     @torch.inference_mode()
     def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
-        """Return what the DistanceModule says of each patch: (M,)."""
-        points, held = torch.from_numpy(here).to(self.device), _Held.of(cut, scales, {}, self.device)
-        batches = (slice(i, i + self.batch) for i in range(0, len(cut.seeds), self.batch))
-        with self._current():
-            found = [self._distances(held.cut_out(points, batch)) for batch in batches]
+        """Return what the DistanceModule says of each patch: (M,). Raises TooLarge as `displacements` does."""
+        points, held = self._sent(here, cut, scales, {})
+        with current(self.device):
+            found = list(self._batched(cut, lambda batch: self._distances(held.cut_out(points, batch))))
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
     @torch.inference_mode()
     def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
-        """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before."""
-        points = torch.from_numpy(here).to(self.device)
+        """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before.
+
+        Raises TooLarge where it has no memory for them.
+        """
         nearest = min(AROUND, PATCH_SIZE - 1, len(here) - 1)
-        around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
-        for cut in tiling.cuts():
-            held = _Held.of(cut, np.ones(len(cut.seeds)), {}, self.device)
-            for first in range(0, len(cut.seeds), self.batch):
-                batch = slice(first, first + self.batch)
-                x, index, owned = held.cut_out(points, batch), held.index[batch], held.owned[batch]
-                rows = max(1, int(cut.owned[batch].max()))
-                patch, row = (torch.arange(rows, device=self.device) < owned[:, None]).nonzero(as_tuple=True)
-                with self._current():
-                    found = knn(x, nearest, rows)[patch, row].long()  # (n, k), in any order
-                far = (x[patch[:, None], found] - x[patch, row][:, None]).square().sum(dim=2)
-                found = found.gather(1, far.argsort(dim=1))
-                around[index[patch, row].long()] = index[patch[:, None], found]
-        moved: Floats = spread_among(points, around, limit).cpu().numpy()
+        with current(self.device), enough_memory(self.device, len(here)):
+            points = torch.from_numpy(here).to(self.device)
+            around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
+            for cut in tiling.cuts():
+                held = _Held.of(cut, np.ones(len(cut.seeds)), {}, self.device)
+                for _ in self._batched(cut, partial(_look_around, points, cut, held, around)):
+                    pass
+            moved: Floats = spread_among(points, around, limit).cpu().numpy()
         return moved
 
-    def _current(self) -> AbstractContextManager[object]:
-        """Make the device torch's current one: Triton and captures work on no other."""
-        return torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
+    def _sent(
+        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
+    ) -> tuple[torch.Tensor, _Held]:
+        with current(self.device), enough_memory(self.device, len(here)):
+            return torch.from_numpy(here).to(self.device), _Held.of(cut, scales, probed, self.device)
+
+    def _batched(self, cut: Patches, call: Callable[[slice], _T]) -> Iterator[_T]:
+        """Call with batch after batch of a cut's patches, with halves where memory runs out."""
+        first = 0
+        while first < len(cut.seeds):
+            batch = slice(first, first + self.batch)
+            try:
+                made = call(batch)
+            except torch.OutOfMemoryError as exc:
+                self._halve(cut, exc)
+                continue
+            first = batch.stop
+            yield made
+
+    def _halve(self, cut: Patches, exc: torch.OutOfMemoryError) -> None:
+        if self.batch == 1:
+            raise TooLarge(f"{self.device} has no memory for a patch of {cut.index.shape[1]} points") from exc
+        self.batch //= 2
+        self._graphs.clear()
+        torch.cuda.empty_cache()
 
     def _finished(self, batch: range, result: _Result, cut: Patches, finish: Finish[_T]) -> Iterator[_T]:
         moves = result.read().astype(np.float64)
@@ -221,6 +245,17 @@ class _Held:
     def cut_out(self, points: torch.Tensor, batch: torch.Tensor | slice) -> torch.Tensor:
         """Cut some patches out of the points."""
         return cut_out(points, self.index[batch], self.seeds[batch], self.scales[batch])
+
+
+def _look_around(points: torch.Tensor, cut: Patches, held: _Held, around: torch.Tensor, batch: slice) -> None:
+    """Write the rows of the points nearest to each that some patches own into around (N, k), nearest first."""
+    x, index, owned = held.cut_out(points, batch), held.index[batch], held.owned[batch]
+    rows = max(1, int(cut.owned[batch].max()))
+    patch, row = (torch.arange(rows, device=points.device) < owned[:, None]).nonzero(as_tuple=True)
+    found = knn(x, around.shape[1], rows)[patch, row].long()  # (n, k), in any order
+    far = (x[patch[:, None], found] - x[patch, row][:, None]).square().sum(dim=2)
+    found = found.gather(1, far.argsort(dim=1))
+    around[index[patch, row].long()] = index[patch[:, None], found]
 
 
 class _Result:

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from straightpcf.model.distinct import Distinct
 from straightpcf.model.normalize import CloudFrame, is_scene
 from straightpcf.model.patches import PATCH_SIZE
 
@@ -34,7 +35,7 @@ _BLOCK = 2**16  # points whose neighbours are held at once
 def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
     none = np.zeros(len(xyz), dtype=bool)
-    some = np.unique(xyz[:: max(1, len(xyz) // _SOME)], axis=0)  # where many rows say "no data", all say the same
+    some = Distinct(xyz[:: max(1, len(xyz) // _SOME)]).xyz  # where many rows say "no data", all say the same
     if len(some) == 0:
         return none
     middle = np.median(some / 2, axis=0)  # halves: a difference may overflow

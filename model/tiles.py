@@ -45,12 +45,7 @@ def parted(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]], par
 
     Points are dealt out in the order of a k-d tree's leaves, where neighbours follow one another; tile by tile.
     """
-    dealt: list[list[npt.NDArray[np.int64]]] = [[] for _ in range(parts)]
-    for rows in tiles:
-        order = rows[cKDTree(xyz[rows]).indices]
-        for part, into in enumerate(dealt):
-            into.append(order[part::parts])
-    return [np.sort(np.concatenate(rows)) for rows in dealt]
+    return _dealt(_by_leaves(xyz, tiles), parts)
 
 
 class Tiling:
@@ -82,6 +77,14 @@ class Tiling:
         if len(self.tiles) > 1:
             return None
         return self._cut(self._xyz)
+
+    def parted(self, parts: int) -> list[npt.NDArray[np.int64]]:
+        """Do what `parted` does for the pass's points; a tree of them is built once, however often it is asked."""
+        return _dealt(self._ordered, parts)
+
+    @cached_property
+    def _ordered(self) -> list[npt.NDArray[np.int64]]:
+        return _by_leaves(self._xyz, self.tiles)
 
     def probes(self, count: int = _PROBES) -> tuple[Patches, range]:
         """Return about `count` patches spread over the cloud, to look at, and which of the whole cut they are."""
@@ -120,6 +123,14 @@ class Tiling:
             self.probes()
         for core, margin in zip(self.tiles, self._margins, strict=True):
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
+
+
+def _by_leaves(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]) -> list[npt.NDArray[np.int64]]:
+    return [rows[cKDTree(xyz[rows]).indices] for rows in tiles]
+
+
+def _dealt(ordered: list[npt.NDArray[np.int64]], parts: int) -> list[npt.NDArray[np.int64]]:
+    return [np.sort(np.concatenate([rows[part::parts] for rows in ordered])) for part in range(parts)]
 
 
 def _halo(xyz: npt.NDArray[np.float64], core: npt.NDArray[np.int64], margin: float) -> npt.NDArray[np.int64]:

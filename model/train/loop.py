@@ -102,7 +102,7 @@ def train(
     rng = np.random.default_rng(seed)
     run_dir.mkdir(parents=True, exist_ok=True)
     state_path = run_dir / STATE_FILE
-    if place.type == "cuda":
+    if place.type == "cuda" and place.index is not None:  # "cuda" is the current one, and set_device takes no other
         torch.cuda.set_device(place)  # captures and Triton work on the current one
 
     resuming = state_path.exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import time
 from dataclasses import dataclass
@@ -120,8 +121,10 @@ def _load(spec: WorkerSpec) -> Filter:
     count, options = WARM_UP_POINTS, DenoiseOptions()
     if denoiser.device != "cpu":  # between passes points are spread, which is compiled there, too
         count, options = DEVICE_WARM_UP_POINTS, DenoiseOptions(iterations=2)
-    directions = np.random.default_rng(0).normal(size=(count, 3))
-    denoiser.denoise(directions / np.linalg.norm(directions, axis=1, keepdims=True), options)
+    # Spread evenly, on a spiral: points that lie by chance are not spread between passes.
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle, radius = math.pi * (3 - math.sqrt(5)) * np.arange(count), np.sqrt(1 - height**2)
+    denoiser.denoise(np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1), options)
     return denoiser
 
 
@@ -148,13 +151,17 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
             return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview))
     except (EOFError, BrokenPipeError):
         raise
+    except StraightPCFError as error:
+        return Failed(job.id, error.code, error.message)
     except Exception as error:
+        from straightpcf.model.device import is_lost
+
+        if is_lost(denoiser.device):
+            raise  # this process is of no use any more: another one takes its place, and the job
         return _failure(job.id, error)
 
 
 def _failure(job_id: str, error: Exception) -> Failed:
-    if isinstance(error, StraightPCFError):
-        return Failed(job_id, error.code, error.message)
     logger.exception("the worker met an error of no kind of ours")
     if isinstance(error, MemoryError):
         return Failed(job_id, TooLarge.code, "the cloud does not fit in this server's memory")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.filter import MIN_POINTS, Filter, load_filter
+from straightpcf.model.filter import MIN_POINTS, Filter, device_named, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, JobCanceled, TooFewPoints
@@ -311,6 +311,14 @@ def test_options_may_be_numbers_of_numpy(tiny: Filter) -> None:
 def test_a_device_that_is_not_here_is_named() -> None:
     with pytest.raises(DeviceUnavailable, match="cuda"):
         load_filter(device="cuda")
+
+
+def test_a_device_that_its_driver_cannot_serve_is_not_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert device_named("auto") == "cpu"
+    with pytest.raises(DeviceUnavailable, match="0 CUDA devices"):
+        device_named("cuda")
 
 
 @pytest.mark.parametrize("name", ["tpu", "cuda:", "cuda:x", "auto:1", ""])

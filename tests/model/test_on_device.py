@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from straightpcf.model import device_patches
+from straightpcf.model import on_device as device_path
+from straightpcf.model.device_patches import cut_patches_on
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import Capture, Graphs, OnDevice
@@ -151,3 +154,38 @@ def test_out_of_memory_halves_the_batch_and_goes_on(network: StraightPCF) -> Non
     assert small.processor.batch == 2
     with pytest.raises(TooLarge, match="patch of 1000"):
         on_device(_SmallMemory(network, 0), batch=8).denoise(cloud, options)
+
+
+def test_out_of_memory_halves_the_batch_of_what_reads_and_spreads_too(
+    network: StraightPCF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def most(call: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
+        def small(x: torch.Tensor, *how: Any) -> torch.Tensor:
+            if len(x) > 3:
+                raise torch.OutOfMemoryError(f"{len(x)} patches")
+            return call(x, *how)
+
+        return small
+
+    ball = sphere(3000, 0)
+    tiling = Tiling(ball, split(ball, 10_000), coverage=3, seed=0)
+    cut = next(tiling.cuts())
+    scales = np.ones(len(cut.seeds))
+    large = OnDevice(network.forward, network.distance_module, "cpu", batch=8)  # type: ignore[arg-type]
+    small = OnDevice(network.forward, most(network.distance_module), "cpu", batch=8)  # type: ignore[arg-type]
+    np.testing.assert_allclose(small.distances(ball, cut, scales), large.distances(ball, cut, scales), atol=1e-6)
+    assert small.batch == 2
+    expected = large.spread(ball, tiling, 1.0)
+    small.batch = 8
+    monkeypatch.setattr(device_path, "knn", most(device_path.knn))
+    np.testing.assert_array_equal(small.spread(ball, tiling, 1.0), expected)
+    assert small.batch == 2
+
+
+def test_a_cloud_that_a_device_cannot_hold_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*given: Any) -> torch.Tensor:
+        raise torch.OutOfMemoryError("all gone")
+
+    monkeypatch.setattr(device_patches, "squared_distances", full)
+    with pytest.raises(TooLarge, match="cpu has no memory for 2000 points"):
+        cut_patches_on(torch.device("cpu"), sphere(2000, 0), coverage=3, seed=0)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from straightpcf.model import tiles as model_tiles
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.spread import spread
@@ -35,6 +36,17 @@ def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, e
     assert np.array_equal(np.sort(np.concatenate(rows)), np.arange(count))
     assert max(map(len, rows)) - min(map(len, rows)) <= len(tiles)
     assert all((np.diff(part) > 0).all() for part in rows)
+
+
+def test_a_pass_that_is_parted_again_builds_no_second_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz = torus(3000)
+    tiling = Tiling(xyz, tiles := split(xyz, 1000), coverage=3, seed=0)
+    expected = [parted(xyz, tiles, parts) for parts in (1, 2, 5)]
+    built: list[int] = []
+    monkeypatch.setattr(model_tiles, "cKDTree", lambda points: built.append(len(points)) or cKDTree(points))
+    for parts, rows in zip((1, 2, 5), expected, strict=True):
+        assert all(map(np.array_equal, tiling.parted(parts), rows))
+    assert len(built) == len(tiles)
 
 
 def test_parts_are_as_evenly_spread_as_the_whole() -> None:

@@ -13,7 +13,7 @@ import torch
 from straightpcf.model.checkpoint import load_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train import Stage, TrainStep, train
+from straightpcf.model.train import Stage, TrainStep, loop, train
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, velocity_loss
 from straightpcf.model.train.soap import SOAP
@@ -66,6 +66,27 @@ def test_soap_finds_the_axes_of_an_ill_conditioned_problem() -> None:
         return (w.detach() - wanted).norm().item()
 
     assert distance_after(200, SOAP) < 0.05 * distance_after(200, torch.optim.Adam)
+
+
+@pytest.mark.parametrize(("device", "chosen"), [("cuda", []), ("cuda:1", [torch.device("cuda:1")])])
+def test_training_makes_a_device_current_where_one_is_named(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, chosen: list[torch.device]
+) -> None:
+    # torch.cuda.set_device refuses "cuda", which is the current one anyway.
+    current: list[torch.device] = []
+
+    class Sent(Exception):  # noqa: N818
+        pass
+
+    def send(*_: object) -> None:
+        raise Sent
+
+    monkeypatch.setattr(loop, "device_named", lambda name: name)
+    monkeypatch.setattr(torch.cuda, "set_device", current.append)
+    monkeypatch.setattr(torch.nn.Module, "to", send)
+    with pytest.raises(Sent):
+        train("vm", data=data, run_dir=tmp_path, iterations=1, device=device)
+    assert current == chosen
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")

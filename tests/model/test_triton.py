@@ -70,9 +70,9 @@ for points, channels, k, rows in ((1000, 3, 32, 1000), (1000, 3, 16, 401), (1000
 for width in (16, 32, 64, 128, 256):
     a, b, index = torch.zeros(2, 384, width), torch.zeros(2, 1000, width), torch.zeros(2, 384, 32, dtype=torch.int32)
     cuda.edge_max(a, b, index, torch.zeros(width, width))
-for first in (0, 1, 7):
-    cuda.farthest(torch.zeros(50_000, 3), 150, first)
-assert len(made) == 15, made
+for count, wanted, first in ((50_000, 150, 0), (50_000, 150, 1), (50_000, 150, 7), (333, 1, 1)):
+    cuda.farthest(torch.zeros(count, 3), wanted, first)
+assert len(made) == 16, made
 assert all(kernel.asm["cubin"] and kernel.metadata.shared <= 227 * 1024 for kernel in made)
 print("compiled")
 """

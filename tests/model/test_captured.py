@@ -1,0 +1,115 @@
+"""What a CUDA graph is to hold never waits for the device nor takes anything from the host, shown without either.
+
+Meta tensors stand in for those of a device: they have shapes and no values, so nothing that asks for a value runs.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from straightpcf.model.kernels import cuda
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.on_device import OnDevice, _Held
+from straightpcf.model.patches import Patches
+from straightpcf.model.train.data import PatchSource
+from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
+from straightpcf.model.train.soap import SOAP
+from straightpcf.model.train.step import GraphedStep
+from straightpcf.model.turns import turns
+from tests.clouds import torus
+
+DEVICE = torch.device("meta")
+# Beside what meta tensors refuse by themselves: on a GPU these read their result's size, or an error, on the host.
+WAIT = {"_local_scalar_dense", "equal", "nonzero", "masked_select", "unique", "_unique2", "bincount", "linalg_eigh"}
+
+
+class Captured(TorchDispatchMode):
+    """Refuse what a capture refuses."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        tensors = [leaf for leaf in torch.utils._pytree.tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        assert name not in WAIT, f"{name} waits for the device"
+        assert all(tensor.device == DEVICE for tensor in tensors), f"{name} reads from the host"
+        made = func(*args, **(kwargs or {}))
+        for tensor in torch.utils._pytree.tree_leaves(made):
+            assert not isinstance(tensor, torch.Tensor) or tensor.device == DEVICE, f"{name} makes a tensor of the host"
+        return made
+
+
+class OnCuda(TorchFunctionMode):
+    """Let meta tensors say that they are on a GPU."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return True if func == torch.Tensor.is_cuda.__get__ else func(*args, **(kwargs or {}))  # type: ignore[attr-defined]
+
+
+@pytest.fixture(autouse=True)
+def shapes_for_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
+        return x.new_empty((len(x), rows, k), dtype=torch.int32)
+
+    def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        return a.new_empty((*a.shape[:2], len(weight)))
+
+    for name, shaped in {"load": lambda: True, "knn": knn, "edge_max": edge_max}.items():
+        monkeypatch.setattr(cuda, name, shaped)
+
+
+def on_device() -> StraightPCF:
+    with DEVICE:
+        return StraightPCF(width=64, distance_width=64).eval()
+
+
+@pytest.mark.parametrize("read_before", [False, True])
+def test_the_network_of_a_pass_can_be_captured(*, read_before: bool) -> None:
+    network, positions = on_device().requires_grad_(requires_grad=False), turns(6).to(DEVICE)
+    x, owned = torch.empty(4, 1000, 3, device=DEVICE), torch.empty(4, dtype=torch.int64, device=DEVICE)
+    distance = torch.empty(4, 1, device=DEVICE) if read_before else None
+    with torch.inference_mode(), OnCuda(), Captured():
+        moved, _ = network(x, rows=384, owned=owned, distance=distance, turns=positions)
+    assert moved.shape == (4, 384, 3)
+
+
+@pytest.mark.parametrize("probed", [{}, dict.fromkeys(range(40), 0.5)])
+def test_launching_a_batch_waits_for_nothing(probed: dict[int, float]) -> None:
+    network, captured = on_device().requires_grad_(requires_grad=False), []
+
+    def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+        moved: torch.Tensor = network(x, rows=rows, owned=owned, distance=distance)[0]
+        return moved
+
+    def capture(run: Any) -> tuple[Any, torch.Tensor]:
+        captured.append(run)
+        return run, run()
+
+    rows, each = np.arange(40), np.ones(40)
+    cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
+    processor = OnDevice(forward, network.distance_module, "meta", batch=8, capture=capture)
+    points, held = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE), _Held.of(cut, each, probed, DEVICE)
+    with OnCuda(), Captured():
+        for first in range(0, 40, 8):
+            assert processor._launch(points, cut, held, range(first, first + 8)).shape[0] == 8
+    assert len(captured) == 2  # rows up to 128 and to 256 come twice, up to 384 once
+
+
+@pytest.mark.parametrize("loss", [velocity_loss, coupled_loss, distance_loss])
+def test_an_iteration_of_training_can_be_captured(loss: Any) -> None:
+    network = on_device()
+    trained: torch.nn.Module = network.velocity_modules
+    if loss is distance_loss:
+        trained, _ = network.distance_module, network.velocity_modules.requires_grad_(requires_grad=False)
+    source = PatchSource([[torus(4500).astype(np.float32), torus(7000).astype(np.float32)]])
+    optimiser = SOAP(trained.train().parameters())
+    step = GraphedStep(source, partial(loss, network, rows=256), trained, optimiser, DEVICE, 4)
+    with OnCuda():
+        step._run()  # what is set up in the first iterations is not captured
+        with Captured():
+            step._run()
