@@ -31,9 +31,9 @@ from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
-from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 from straightpcf.service.web import ASSET_PREFIX, install_page
@@ -169,7 +169,7 @@ def _check_start(settings: Settings) -> None:
             JobFolders(settings.data_dir).close()
             with tempfile.TemporaryFile(dir=settings.data_dir):
                 pass
-            JobStore(settings.data_dir / "jobs.sqlite3").close()
+            check_database(settings.data_dir / "jobs.sqlite3")
     except (OSError, sqlite3.Error, SpoolFull) as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
