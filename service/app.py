@@ -136,9 +136,17 @@ class _Server(uvicorn.Server):
         self._engine = engine
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to shut down."""
+        """Begin to shut down; at a second Ctrl-C wait for nothing more."""
         self._engine.drain()
         super().handle_exit(sig, frame)
+        if self.force_exit:
+            self._engine.hurry()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Shut the app down in a hurry, too: uvicorn leaves out its end then, and with it that of the workers."""
+        await super().shutdown(sockets)
+        if self.force_exit and not self.lifespan.shutdown_event.is_set():
+            await self.lifespan.shutdown()
 
 
 def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Telemetry) -> GrpcServer | None:
