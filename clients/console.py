@@ -43,6 +43,7 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (ModuleNotFoundError, 4),
     (errors.ServerBusy, 5),
     (errors.ConnectionFailed, 5),
+    (errors.RequestTimeout, 5),
     (errors.JobNotFinished, 5),
     (errors.JobCanceled, INTERRUPTED),
     (errors.InternalError, 70),

@@ -15,6 +15,7 @@ StraightPCFError
 ├── Unauthorized            no key, or an unknown one
 ├── NotFound                no such thing, or not yours
 ├── MethodNotAllowed
+├── RequestTimeout          its body stopped coming
 ├── JobNotFinished          its result is not there yet
 ├── JobExpired              its result is not there any more
 ├── JobCanceled
@@ -56,6 +57,7 @@ __all__ = [
     "QuotaExceeded",
     "RangeNotSatisfiable",
     "RateLimited",
+    "RequestTimeout",
     "ServerBusy",
     "SpoolFull",
     "StraightPCFError",
@@ -195,6 +197,13 @@ class MethodNotAllowed(StraightPCFError):  # noqa: N818
     """Report a method that the path does not have."""
 
     code = "method_not_allowed"
+
+
+class RequestTimeout(StraightPCFError):  # noqa: N818
+    """Report a body that stopped coming in before its end."""
+
+    code = "request_timeout"
+    retryable = True
 
 
 class JobNotFinished(StraightPCFError):  # noqa: N818

@@ -208,6 +208,7 @@ def _limits(settings: Settings) -> Limits:
         max_spool_bytes=settings.max_spool_bytes,
         min_free_bytes=settings.min_free_bytes,
         max_sync_seconds=settings.max_sync_seconds,
+        upload_idle_seconds=settings.upload_idle_seconds,
         result_ttl_seconds=settings.result_ttl_seconds,
         row_ttl_seconds=settings.row_ttl_seconds,
         shutdown_seconds=settings.shutdown_seconds,

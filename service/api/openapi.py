@@ -194,6 +194,7 @@ _PROBLEMS = {
     400: "The request itself is broken (`invalid_request`).",
     401: "No API key, or an unknown one (`unauthorized`).",
     404: "There is no such job, or not for this key (`not_found`).",
+    408: "The body stopped coming (`request_timeout`).",
     409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
     410: "Its files have been removed (`job_expired`).",
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
@@ -225,7 +226,7 @@ def document_problems(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-_INTAKE = (400, 401, 409, 413, 415, 422, 429, 500, 503, 507)
+_INTAKE = (400, 401, 408, 409, 413, 415, 422, 429, 500, 503, 507)
 _JOB: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
 _LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type": "string"}}}
 

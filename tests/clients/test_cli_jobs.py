@@ -187,15 +187,17 @@ def test_a_second_ctrl_c_is_as_quiet_as_the_first(tmp_path: Path, pause: float) 
     np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
     command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]
     command += ["--device", "cpu", "--threads", "1"]
-    process = subprocess.Popen(command, env=clean_environment(), stderr=subprocess.PIPE)
-    wait_for(lambda: list(tmp_path.glob(".clean.*.part.npy")))
-    time.sleep(0.5)
-    while process.poll() is None:
-        process.send_signal(signal.SIGINT)
-        time.sleep(pause or 0.001)
-    assert process.stderr is not None
-    assert (process.returncode, process.stderr.read()) == (130, b"")
-    process.stderr.close()
+    with subprocess.Popen(command, env=clean_environment(), stderr=subprocess.PIPE) as process:
+        try:
+            wait_for(lambda: list(tmp_path.glob(".clean.*.part.npy")), seconds=60)
+            time.sleep(0.5)
+            while process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                time.sleep(pause or 0.001)
+        finally:
+            process.kill()
+        assert process.stderr is not None
+        assert (process.returncode, process.stderr.read()) == (130, b"")
     assert list(tmp_path.iterdir()) == [large]
 
 
