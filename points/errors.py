@@ -15,6 +15,7 @@ StraightPCFError
 ├── Unauthorized            no key, or an unknown one
 ├── NotFound                no such thing, or not yours
 ├── MethodNotAllowed
+├── MisdirectedRequest      for a host that this server is not
 ├── RequestTimeout          its body stopped coming
 ├── JobNotFinished          its result is not there yet
 ├── JobExpired              its result is not there any more
@@ -52,6 +53,7 @@ __all__ = [
     "JobNotFinished",
     "MalformedFile",
     "MethodNotAllowed",
+    "MisdirectedRequest",
     "MissingDependency",
     "NotFound",
     "QuotaExceeded",
@@ -197,6 +199,12 @@ class MethodNotAllowed(StraightPCFError):  # noqa: N818
     """Report a method that the path does not have."""
 
     code = "method_not_allowed"
+
+
+class MisdirectedRequest(StraightPCFError):  # noqa: N818
+    """Report a request for a host that this server does not answer for."""
+
+    code = "misdirected_request"
 
 
 class RequestTimeout(StraightPCFError):  # noqa: N818

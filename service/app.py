@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import socket
 import sqlite3
@@ -23,6 +22,7 @@ from straightpcf.points.errors import InvalidOptions, MissingDependency, SpoolFu
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
+from straightpcf.service.api.hosts import HostMiddleware, is_loopback
 from straightpcf.service.api.jobs import router as jobs_router
 from straightpcf.service.api.openapi import document_problems
 from straightpcf.service.api.request_id import RequestIdMiddleware
@@ -81,6 +81,9 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.state.engine = engine
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
+    if gate.open and is_loopback(settings.host):
+        hosts = tuple(host.strip().lower() for host in settings.allowed_hosts.split(",") if host.strip())
+        app.add_middleware(HostMiddleware, hosts=hosts)
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
     if origins := [origin.strip() for origin in settings.cors_origins.split(",") if origin.strip()]:
@@ -116,7 +119,7 @@ def serve(settings: Settings) -> None:
         server.should_exit = True
 
     backend.on_failure = end
-    if app.state.gate.open and not _is_loopback(settings.host):
+    if app.state.gate.open and not is_loopback(settings.host):
         logger.warning(
             "NO API KEYS ARE SET and this server listens on %s: everyone who reaches it may use it and see every job. "
             "Set STRAIGHTPCF_API_KEYS or STRAIGHTPCF_API_KEYS_FILE.",
@@ -189,13 +192,6 @@ def _check_start(settings: Settings) -> None:
                 socket.create_server((settings.host, port), family=family).close()
             except OSError as exc:
                 raise InvalidOptions(f"{name} is {port}, which cannot be had: {exc}") from exc
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _limits(settings: Settings) -> Limits:

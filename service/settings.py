@@ -45,6 +45,7 @@ class Settings:
     upload_idle_seconds: how long a body that has not come to its end may bring nothing.
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
+    allowed_hosts: comma-separated names by which a server without keys on loopback may be asked beside loopback's own.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
     weights: None for the shipped ones.  threads: None for one for each CPU.
@@ -70,6 +71,7 @@ class Settings:
     row_ttl_seconds: float = 86400.0
     api_keys: str = ""
     api_keys_file: Path | None = None
+    allowed_hosts: str = ""
     cors_origins: str = ""
     device: str = "auto"
     weights: Path | None = None

@@ -200,6 +200,7 @@ _PROBLEMS = {
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
     415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
     416: "No byte of the result is in the range (`range_not_satisfiable`).",
+    421: "This server has no keys and does not answer for that host (`misdirected_request`).",
     422: "A parameter, an option, a key or the cloud is unusable (`invalid_request`, `invalid_options`, "
     "`malformed_file`, `too_few_points`, `invalid_cloud`, `unsupported_cloud`, `idempotency_conflict`).",
     429: "This key has too many requests or jobs (`rate_limited`, `quota_exceeded`); see Retry-After.",
@@ -211,7 +212,7 @@ _PROBLEMS = {
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe problems by status."""
-    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 422, 429})}
+    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 421, 422, 429})}
 
 
 def document_problems(app: FastAPI) -> None:

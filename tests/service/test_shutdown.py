@@ -99,7 +99,9 @@ def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path:
         forms = (b"", b"Content-Type: multipart/form-data; boundary=b\r\n")
         uploads = [socket.create_connection((host, int(port)), timeout=20) for _ in forms]
         for upload, form in zip(uploads, forms, strict=True):
-            upload.sendall(b"POST /jobs HTTP/1.1\r\nHost: x\r\n" + form + b"Content-Length: 100000\r\n\r\n--b\r\n")
+            upload.sendall(
+                b"POST /jobs HTTP/1.1\r\nHost: localhost\r\n" + form + b"Content-Length: 100000\r\n\r\n--b\r\n"
+            )
         wait_for(lambda: len(list(server.data_dir.glob("incoming/*"))) == 2)
         server.process.send_signal(signal.SIGTERM)
         for upload in uploads:
