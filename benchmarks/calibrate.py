@@ -3,7 +3,8 @@
 python -m benchmarks.calibrate --state runs/dm/state.safetensors --out
 
 Uses the training shapes, never the test split. Prints the table of d against known noise, and what `auto`
-would do against the best fixed number of passes.
+would do against the best fixed number of passes. With --keep nothing is measured: the DistanceModule and the
+calibration of other weights go with the state's velocities.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +24,13 @@ from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import read_checkpoint, save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
+from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
 
 # The table is read of every fifth shape's 50K points: with 3 % of noise d is lower there than at 10K, and noise read
-# too low costs more than noise read too high (docs/training.md).
+# too low costs more than noise read too high (docs/filter.md).
 _TABLE_CLOUDS, _TABLE_EVERY = "50000", 5
 
 
@@ -40,6 +43,7 @@ def main() -> None:
         "--mean", type=Path, help="a state trained on from this one: take the mean of both's velocities"
     )
     parser.add_argument("--table", type=Path, help="weights whose table of noise to keep, instead of reading a new one")
+    parser.add_argument("--keep", type=Path, help="weights whose DistanceModule and calibration to keep as they are")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
@@ -52,10 +56,15 @@ def main() -> None:
     arguments = parser.parse_args()
 
     network, progress = read_network(arguments.state)
-    if arguments.distance is not None:
-        take_distance_module(network, arguments.distance)
     if arguments.mean is not None:
         average_with(network, arguments.mean)
+        progress["mean_with"] = read_network(arguments.mean)[1]
+    if arguments.keep is not None:
+        take_distance_module(network, arguments.keep)
+        _write(network, progress, Calibration.from_metadata(read_checkpoint(arguments.keep)[1]), arguments.out)
+        return
+    if arguments.distance is not None:
+        take_distance_module(network, arguments.distance)
     with np.load(arguments.data, allow_pickle=False) as archive:
         shapes = sorted({key.split("/")[0] for key in archive.files})
         dense = _read(archive, [f"{shape}/{_TABLE_CLOUDS}" for shape in shapes[1::_TABLE_EVERY]])
@@ -81,11 +90,15 @@ def main() -> None:
         those = [t for t in traces if t.level == level]
         ratio = np.mean([t.chamfer[passes(calibration, t)] / max(min(t.chamfer[1:]), 1e-12) for t in those])
         print(f"{resolution:>6} {kind:8.8} {std:7.4f} {np.median([t.distances[0] for t in those]):7.3f} {ratio:15.3f}")
+    _write(network, progress, calibration, arguments.out)
+
+
+def _write(network: StraightPCF, progress: dict[str, Any], calibration: Calibration, out: Path | None) -> None:
     print(json.dumps(calibration.to_metadata()))
-    if arguments.out is not None:
-        save_checkpoint(network, arguments.out, {"training": progress, **calibration.to_metadata()})
-        arguments.out.chmod(0o644)
-        print(f"written {arguments.out}")
+    if out is not None:
+        save_checkpoint(network, out, {"training": progress, **calibration.to_metadata()})
+        out.chmod(0o644)
+        print(f"written {out}")
 
 
 def _read(archive: Mapping[str, npt.NDArray[np.float32]], names: list[str]) -> dict[str, npt.NDArray[np.float64]]:

@@ -52,7 +52,7 @@ COVERAGE = 3.0  # patches per point; the published scheme takes 6 (benchmarks/RE
 FULL_EVALUATIONS = 1  # of a patch's evaluations, made for all of its points; the others for those that it owns
 TILE_POINTS = 1_000_000  # cut at once; docs/kernels.md has what that costs
 _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 and K = 2
-# Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/training.md, "Few points").
+# Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/filter.md, "Few points").
 _FEW_POINTS = 500
 _FEWEST_APART = 100  # points among which one may lie apart
 _EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes

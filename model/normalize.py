@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
-# to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training.md says how they were measured).
+# to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training-log.md, "The first run").
 _SMALLEST_RADIUS, _LARGEST_RADIUS = 0.1, 0.58
 _USUAL_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
@@ -81,7 +81,7 @@ def zoom_of(
 
     shown: the std that its noise is brought to, where limits allow it; smallest: the least factor.
     Noise and thin walls look alike, and a patch alone does not tell how much noise its cloud has. With the noise of
-    every cloud brought to about one size, all else in a patch tells which it is (docs/training.md has the figures).
+    every cloud brought to about one size, all else in a patch tells which it is (docs/filter.md has the figures).
     More noise than the network bears is made less, and the object smaller with it.
     """
     largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
@@ -113,7 +113,7 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tu
 
     noise_std, radii: in the unit ball, radii of some patches of the whole cloud. A patch is the 1000 nearest points,
     however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
-    has patches of sqrt(m) times the radius, at the same cost (docs/training.md, "Parts").
+    has patches of sqrt(m) times the radius, at the same cost (docs/filter.md, "Parts").
     """
     wanted = noise_in_radii(noise_std, radii) / _NOISE_A_PART
     most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
@@ -126,7 +126,7 @@ def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1
     """Return the factor that brings each patch of the unit-ball cloud to a size the network knows, (M,) float64.
 
     Patches of an object sampled like the training clouds are shown `zoom` times their size: at 1 this is the paper's
-    frame. Those of a scene are brought to the usual size, or keep a larger one (docs/training.md says why not to the
+    frame. Those of a scene are brought to the usual size, or keep a larger one (docs/filter.md says why not to the
     nearest that was seen). Patches that would be smaller or larger than any in training are brought to these limits,
     the upper one zoomed. One of radius 0 keeps the factor 1.
     """

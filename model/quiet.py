@@ -2,7 +2,7 @@
 
 Where the distance between points is a good part of a shape's radii of curvature, the network takes shape for noise: it
 moves 1000 clean points of a bust by 0.5 % of its radius. A surface of second order through a few neighbours tells the
-two apart, as long as noise does not tilt it (docs/training.md, "Little noise").
+two apart, as long as noise does not tilt it (docs/filter.md, "Little noise").
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from straightpcf.model.walls import share_between_walls
 
 __all__ = ["across", "made_of", "reaches", "restrained"]
 
-# In noise stds: moves up to the first are made whole, from the last on none is (docs/training.md, "How far ...").
+# In noise stds: moves up to the first are made whole, from the last on none is (docs/filter.md, "How far ...").
 _WHOLE, _NONE = 3.0, 4.0
 _SHEET = 1.3  # a patch is one sheet where its points lie so many of its noise stds from their plane, or nearer
 _MOST = 3.0  # of the usual noise, what is believed of any sheet

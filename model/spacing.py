@@ -19,7 +19,7 @@ __all__ = ["Lie"]
 
 # The ratio of the areas that a point's nearest 8 and nearest 32 others take varies, as a logarithm, with a std of
 # 0.3 where points fall by chance (a beta distribution's 0.32, less what counting leaves out), and of 0.12 to 0.17 where
-# they were spread evenly. Noise brings the two together: at 0.6 of the spacing to 0.27 and 0.23 (docs/training.md).
+# they were spread evenly. Noise brings the two together: at 0.6 of the spacing to 0.27 and 0.23 (docs/training-log.md).
 _FEW, _MANY = 8, 32
 _SCATTERED, _TELLING = 0.25, 0.6
 # The nearest other's area beside a 32nd of that of 32: 1.4 to 2 where points are even, 0.5 to 1 in lines, in grids of

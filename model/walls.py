@@ -1,7 +1,7 @@
 """Walls closer together than their points are to each other: what the network takes for one surface with noise.
 
 Two walls have few points midway between them, and a noisy surface has most there. Where the network would join them,
-nothing moves (docs/training.md, "Two walls or one").
+nothing moves (docs/filter.md, "Two walls or one").
 """
 
 from __future__ import annotations

@@ -10,8 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks import scenes
+from straightpcf.model.checkpoint import read_checkpoint
+from straightpcf.model.filter import DEFAULT_WEIGHTS
+from tests.clouds import sphere
 
 ROOT = Path(__file__).parent.parent
 
@@ -86,3 +90,29 @@ def test_a_raster_of_hills_has_its_noise_in_height_alone() -> None:
     some = np.array([[0, 0, 0.5], [1, -2, 1.0], [-2, 1, -2.5]])
     nearest = np.linalg.norm(ground[:, None] - some, axis=2).min(axis=0)
     assert scenes.distance_to(scan.parts, some) == pytest.approx(nearest, rel=0.02)
+
+
+def test_weights_of_a_state_keep_what_ships_beside_their_velocities(tmp_path: Path) -> None:
+    shipped, made = DEFAULT_WEIGHTS, tmp_path / "weights.safetensors"
+    printed("calibrate", "--state", shipped, "--mean", shipped, "--keep", shipped, "--out", made)
+    (before, about), (after, says) = (read_checkpoint(path) for path in (shipped, made))
+    assert all(torch.equal(before[name], tensor) for name, tensor in after.items())
+    assert says["calibration"] == about["calibration"]
+    assert says["training"]["mean_with"] == about["training"]
+
+
+def test_candidates_are_compared_on_what_is_held_out(tmp_path: Path) -> None:
+    clouds = {f"{name}/1000": sphere(1000) for name in "abcdefghijkl"}
+    clouds |= {f"{name}/50000": sphere(50_000) for name in "fz"} | {"z/1000": sphere(1000)}
+    np.savez(tmp_path / "trained.npz", **{name: xyz for name, xyz in clouds.items() if name[0] != "z"})
+    np.savez(tmp_path / "unseen.npz", **{name: xyz for name, xyz in clouds.items() if name[0] == "z"})
+    said = printed(
+        "held_out", DEFAULT_WEIGHTS, "--data", tmp_path / "trained.npz", "--unseen", tmp_path / "unseen.npz",
+        "--resolution", 1000, "--noise", 0.02, "--seeds", 0, "--iterations", 1, "--threads", 1,
+    )  # fmt: skip
+    first, row, mean = said.splitlines()
+    assert first.split(" of ")[1] == "f | z"
+    assert row.split("seed 0")[1].count(" | ") == 1
+    chamfer, height = map(float, mean.split("mean")[1].split("/"))
+    assert 0 < height < 4  # the noise's own is 4
+    assert chamfer > height
