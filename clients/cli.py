@@ -24,6 +24,7 @@ from straightpcf.clients.console import (
     print_json,
     print_table,
     progress_bar,
+    quiet_end,
     show_noise,
 )
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
@@ -81,7 +82,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; the console script `straightpcf`."""
-    app(prog_name="straightpcf")
+    with quiet_end():
+        app(prog_name="straightpcf")
 
 
 @app.callback()

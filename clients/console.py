@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 import typer
@@ -25,8 +28,12 @@ __all__ = [
     "print_json",
     "print_table",
     "progress_bar",
+    "quiet_end",
     "show_noise",
 ]
+
+INTERRUPTED = 130
+TIDY_SECONDS = 1.0
 
 # The first class that matches counts: the narrow ones come before those that hold them.
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
@@ -36,8 +43,9 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (ModuleNotFoundError, 4),
     (errors.ServerBusy, 5),
     (errors.ConnectionFailed, 5),
+    (errors.RequestTimeout, 5),
     (errors.JobNotFinished, 5),
-    (errors.JobCanceled, 130),
+    (errors.JobCanceled, INTERRUPTED),
     (errors.InternalError, 70),
     (errors.StraightPCFError, 3),
     (OSError, 3),  # a file that is not there, or may not be written
@@ -74,18 +82,47 @@ def needs(extra: str) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Take SIGTERM, and a terminal that is closed, for Ctrl-C, so that what was begun here and on a server is ended."""
-    import signal
+    """Take SIGTERM, and a terminal that is closed, for Ctrl-C, so that what was begun here and on a server is ended.
 
-    ends = [signal.SIGTERM]
+    Another one is heeded after a while: an impatient one would keep what is done at an end from being done.
+    """
+    import signal
+    import time
+
+    obeyed = -math.inf
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal obeyed
+        if time.monotonic() - obeyed > TIDY_SECONDS:
+            obeyed = time.monotonic()
+            raise KeyboardInterrupt
+
+    ends = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # Windows has none; nohup
         ends.append(signal.SIGHUP)
-    before = {number: signal.signal(number, signal.default_int_handler) for number in ends}
+    before = {number: signal.signal(number, interrupt) for number in ends}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def quiet_end() -> Iterator[None]:
+    """Let a Ctrl-C, while one before it was obeyed or after the command, end the process without a traceback."""
+    import atexit
+    import os
+    import signal
+
+    # At the very end: Python then gives signals back to the system, which would end this with another code.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    finally:
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
 
 
 @contextmanager

@@ -15,6 +15,8 @@ StraightPCFError
 ├── Unauthorized            no key, or an unknown one
 ├── NotFound                no such thing, or not yours
 ├── MethodNotAllowed
+├── MisdirectedRequest      for a host that this server is not
+├── RequestTimeout          its body stopped coming
 ├── JobNotFinished          its result is not there yet
 ├── JobExpired              its result is not there any more
 ├── JobCanceled
@@ -51,11 +53,13 @@ __all__ = [
     "JobNotFinished",
     "MalformedFile",
     "MethodNotAllowed",
+    "MisdirectedRequest",
     "MissingDependency",
     "NotFound",
     "QuotaExceeded",
     "RangeNotSatisfiable",
     "RateLimited",
+    "RequestTimeout",
     "ServerBusy",
     "SpoolFull",
     "StraightPCFError",
@@ -195,6 +199,19 @@ class MethodNotAllowed(StraightPCFError):  # noqa: N818
     """Report a method that the path does not have."""
 
     code = "method_not_allowed"
+
+
+class MisdirectedRequest(StraightPCFError):  # noqa: N818
+    """Report a request for a host that this server does not answer for."""
+
+    code = "misdirected_request"
+
+
+class RequestTimeout(StraightPCFError):  # noqa: N818
+    """Report a body that stopped coming in before its end."""
+
+    code = "request_timeout"
+    retryable = True
 
 
 class JobNotFinished(StraightPCFError):  # noqa: N818

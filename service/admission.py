@@ -26,6 +26,7 @@ class Limits:
     max_spool_bytes: int = 50 * 2**30
     min_free_bytes: int = 0
     max_sync_seconds: float = 300.0
+    upload_idle_seconds: float = 60.0
     result_ttl_seconds: float = 3600.0
     row_ttl_seconds: float = 86400.0
     shutdown_seconds: float = 30.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import socket
 import sqlite3
@@ -23,6 +22,7 @@ from straightpcf.points.errors import InvalidOptions, MissingDependency, SpoolFu
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
+from straightpcf.service.api.hosts import HostMiddleware, is_loopback
 from straightpcf.service.api.jobs import router as jobs_router
 from straightpcf.service.api.openapi import document_problems
 from straightpcf.service.api.request_id import RequestIdMiddleware
@@ -31,9 +31,9 @@ from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
-from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 from straightpcf.service.web import ASSET_PREFIX, install_page
@@ -81,6 +81,9 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.state.engine = engine
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
+    if gate.open and is_loopback(settings.host):
+        hosts = tuple(host.strip().lower() for host in settings.allowed_hosts.split(",") if host.strip())
+        app.add_middleware(HostMiddleware, hosts=hosts)
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
     if origins := [origin.strip() for origin in settings.cors_origins.split(",") if origin.strip()]:
@@ -116,7 +119,7 @@ def serve(settings: Settings) -> None:
         server.should_exit = True
 
     backend.on_failure = end
-    if app.state.gate.open and not _is_loopback(settings.host):
+    if app.state.gate.open and not is_loopback(settings.host):
         logger.warning(
             "NO API KEYS ARE SET and this server listens on %s: everyone who reaches it may use it and see every job. "
             "Set STRAIGHTPCF_API_KEYS or STRAIGHTPCF_API_KEYS_FILE.",
@@ -136,9 +139,17 @@ class _Server(uvicorn.Server):
         self._engine = engine
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to shut down."""
+        """Begin to shut down; at a second Ctrl-C wait for nothing more."""
         self._engine.drain()
         super().handle_exit(sig, frame)
+        if self.force_exit:
+            self._engine.hurry()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Shut the app down in a hurry, too: uvicorn leaves out its end then, and with it that of the workers."""
+        await super().shutdown(sockets)
+        if self.force_exit and not self.lifespan.shutdown_event.is_set():
+            await self.lifespan.shutdown()
 
 
 def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Telemetry) -> GrpcServer | None:
@@ -169,7 +180,7 @@ def _check_start(settings: Settings) -> None:
             JobFolders(settings.data_dir).close()
             with tempfile.TemporaryFile(dir=settings.data_dir):
                 pass
-            JobStore(settings.data_dir / "jobs.sqlite3").close()
+            check_database(settings.data_dir / "jobs.sqlite3")
     except (OSError, sqlite3.Error, SpoolFull) as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
@@ -183,13 +194,6 @@ def _check_start(settings: Settings) -> None:
                 raise InvalidOptions(f"{name} is {port}, which cannot be had: {exc}") from exc
 
 
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _limits(settings: Settings) -> Limits:
     return Limits(
         max_bytes=settings.max_bytes,
@@ -200,6 +204,7 @@ def _limits(settings: Settings) -> Limits:
         max_spool_bytes=settings.max_spool_bytes,
         min_free_bytes=settings.min_free_bytes,
         max_sync_seconds=settings.max_sync_seconds,
+        upload_idle_seconds=settings.upload_idle_seconds,
         result_ttl_seconds=settings.result_ttl_seconds,
         row_ttl_seconds=settings.row_ttl_seconds,
         shutdown_seconds=settings.shutdown_seconds,

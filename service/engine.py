@@ -121,6 +121,10 @@ class Engine:
         if self._ends_at is None:
             self._ends_at = time.monotonic() + self.limits.shutdown_seconds
 
+    def hurry(self) -> None:
+        """Let what runs go on no longer: jobs are put back into the queue."""
+        self._ends_at = time.monotonic()
+
     @property
     def draining(self) -> bool:
         """Whether nothing new is taken."""
@@ -135,7 +139,7 @@ class Engine:
         """Let running jobs finish for a while, put the others back into the queue, and end the backend."""
         self.drain()
         await self._sweeper.stop()
-        await self._runner.stop(patience_seconds=self.patience_seconds)
+        await self._runner.stop(lambda: self.patience_seconds)
         await self.backend.stop()
         await self._call(JobStore.close)
         self._thread.shutdown()

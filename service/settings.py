@@ -22,9 +22,9 @@ _SERVICE_LINK = re.compile(r"\w*_(SERVICE_(HOST|PORT\w*)|PORT_\d+_(TCP|UDP|SCTP)
 _SERVICE_URL = re.compile(r"(tcp|udp|sctp)://.+:\d+")
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
-    "max_sync_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
+    "max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
 )  # fmt: skip
-_SECONDS = ("max_sync_seconds", "result_ttl_seconds", "row_ttl_seconds", "shutdown_seconds")
+_SECONDS = ("max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "row_ttl_seconds", "shutdown_seconds")
 _MAX_SECONDS = 1e9  # three decades; infinitely far ahead there is no date
 
 
@@ -42,8 +42,10 @@ class Settings:
     max_jobs_per_key: waiting and running for one key.  rate_per_minute: requests of one key, 0 for any number.
     max_spool_bytes: inputs, results and patches on the disk, or to come.  min_free_bytes: what it must then have left.
     max_sync_seconds: how long POST /denoise waits before it answers 202.
+    upload_idle_seconds: how long a body that has not come to its end may bring nothing.
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
+    allowed_hosts: comma-separated names by which a server without keys on loopback may be asked beside loopback's own.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
     weights: None for the shipped ones.  threads: None for one for each CPU.
@@ -64,10 +66,12 @@ class Settings:
     max_spool_bytes: int = 50 * 2**30
     min_free_bytes: int = 256 * 2**20
     max_sync_seconds: float = 300.0
+    upload_idle_seconds: float = 60.0
     result_ttl_seconds: float = 3600.0
     row_ttl_seconds: float = 86400.0
     api_keys: str = ""
     api_keys_file: Path | None = None
+    allowed_hosts: str = ""
     cors_origins: str = ""
     device: str = "auto"
     weights: Path | None = None

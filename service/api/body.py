@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -12,12 +12,12 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from straightpcf.points.errors import InvalidOptions, InvalidRequest, ServerBusy, UnknownFormat
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, RequestTimeout, ServerBusy, UnknownFormat
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.disposition import disposition_name
 from straightpcf.service.engine import Engine
 
-__all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "receive_upload"]
+__all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "next_part", "receive_upload"]
 
 FILE_FIELD = "file"
 MAX_FIELDS = 20
@@ -45,7 +45,8 @@ def declared_size(request: Request) -> int:
 async def receive_upload(request: Request, target: Path) -> Upload:
     """Write the request's file to `target`: a form's part named "file", or any other body as it is.
 
-    Raises TooManyBytes, SpoolFull, UnknownFormat, InvalidRequest, ServerBusy; ClientDisconnect if the client goes away.
+    Raises TooManyBytes, SpoolFull, UnknownFormat, InvalidRequest, RequestTimeout, ServerBusy; ClientDisconnect if
+    the client goes away.
     """
     coding = ",".join(request.headers.getlist("content-encoding"))
     if any(each.strip().lower() not in ("", "identity") for each in coding.split(",")):
@@ -68,6 +69,17 @@ async def in_time(engine: Engine, receiving: Coroutine[Any, Any, _T]) -> _T:
         await asyncio.wait([task])  # it writes to a file that is about to be removed
 
 
+async def next_part(parts: AsyncIterator[_T], limits: Limits) -> _T | None:
+    """Return what comes in next, None at the end; raises RequestTimeout where nothing does: it would hold its room."""
+    try:
+        async with asyncio.timeout(limits.upload_idle_seconds):
+            return await anext(parts, None)
+    except TimeoutError:
+        raise RequestTimeout(
+            f"nothing of the body came for {limits.upload_idle_seconds:g} s, and it has not come to its end"
+        ) from None
+
+
 async def _receive(request: Request, target: Path, engine: Engine) -> Upload:
     kind, parameters = parse_options_header(request.headers.get("content-type"))
     with await asyncio.to_thread(target.open, "wb") as file:
@@ -81,8 +93,8 @@ async def _receive(request: Request, target: Path, engine: Engine) -> Upload:
 
 
 async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Upload:
-    received = 0
-    async for chunk in request.stream():
+    received, chunks = 0, request.stream()
+    while (chunk := await next_part(chunks, limits)) is not None:
         limits.check_bytes(received := received + len(chunk))
         spool.buffer += chunk
         await spool.flush(above=WRITE_BYTES)
@@ -91,10 +103,10 @@ async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Up
 
 async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, limits: Limits) -> Upload:
     form = _Form(spool.buffer)
-    received = 0
+    received, chunks = 0, request.stream()
     try:
         parser = MultipartParser(boundary, form.callbacks())
-        async for chunk in request.stream():
+        while (chunk := await next_part(chunks, limits)) is not None:
             limits.check_bytes(received := received + len(chunk))
             parser.write(chunk)
             await spool.flush(above=WRITE_BYTES)

@@ -54,6 +54,8 @@ STATUS_BY_CODE: Mapping[str, int] = {
     "unauthorized": 401,
     "not_found": 404,
     "method_not_allowed": 405,
+    "misdirected_request": 421,
+    "request_timeout": 408,
     "job_not_finished": 409,
     "job_canceled": 409,
     "id_conflict": 409,
@@ -86,6 +88,8 @@ GRPC_STATUS_BY_CODE: Mapping[str, str] = {
     "unauthorized": "UNAUTHENTICATED",
     "not_found": "NOT_FOUND",
     "method_not_allowed": "UNIMPLEMENTED",
+    "misdirected_request": "INVALID_ARGUMENT",
+    "request_timeout": "DEADLINE_EXCEEDED",
     "job_not_finished": "FAILED_PRECONDITION",
     "job_canceled": "ABORTED",
     "id_conflict": "ALREADY_EXISTS",
@@ -187,6 +191,8 @@ def problem_response(
     own = {HEADER: request_id(request)}
     if error.retryable:
         own["Retry-After"] = str(error.retry_after or RETRY_AFTER_SECONDS)
+    if status == 408:
+        own["Connection"] = "close"  # the rest of the body has no place in another request
     if status == 401:
         own["WWW-Authenticate"] = "Bearer"
     return JSONResponse(

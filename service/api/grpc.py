@@ -31,7 +31,7 @@ from straightpcf.points.wire.messages import (
 )
 from straightpcf.points.wire.patches import PatchReader
 from straightpcf.service.api.auth import Gate
-from straightpcf.service.api.body import SpoolFile, in_time
+from straightpcf.service.api.body import SpoolFile, in_time, next_part
 from straightpcf.service.api.download import open_result
 from straightpcf.service.api.grpc_call import Caller, Context, answering
 from straightpcf.service.api.intake import file_name
@@ -135,7 +135,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     async def Denoise(self, requests: AsyncIterator[pb.DenoiseRequest], context: Context) -> None:  # noqa: N802
         """Work on one file while its caller listens."""
         async with self._answering(context, "Denoise") as caller:
-            config = (await in_time(self._engine, _first(requests))).config
+            config = (await in_time(self._engine, _first(requests, self._engine))).config
             # Nobody else knows such a job: it lives as long as its call. Its id is known before it is there, for a call
             # may be cancelled while its job is being committed.
             named = config.job.id or caller.idempotency_key is not None
@@ -165,7 +165,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     ) -> pb.Job:
         """Commit a job."""
         async with self._answering(context, "CreateJob") as caller:
-            config = (await in_time(self._engine, _first(requests))).config
+            config = (await in_time(self._engine, _first(requests, self._engine))).config
             record, _ = await self._take(config, requests, caller, endpoint="jobs", id=config.id or None)
             return _job(record)
 
@@ -278,8 +278,8 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                     yield patch
 
 
-async def _first(requests: AsyncIterator[_Part]) -> _Part:
-    message = await anext(requests, None)
+async def _first(requests: AsyncIterator[_Part], engine: Engine) -> _Part:
+    message = await next_part(requests, engine.limits)
     if message is None or message.WhichOneof("part") != "config":
         raise InvalidRequest("the first message of a call must be its config")
     return message
@@ -290,7 +290,7 @@ async def _receive(requests: AsyncIterator[Any], target: Path, engine: Engine) -
     received = 0
     with await asyncio.to_thread(target.open, "wb") as file:
         spool = SpoolFile(file, engine)
-        async for message in requests:
+        while (message := await next_part(requests, engine.limits)) is not None:
             if message.WhichOneof("part") != "chunk":
                 raise InvalidRequest("a config comes once, before the first chunk")
             engine.limits.check_bytes(received := received + len(message.chunk))

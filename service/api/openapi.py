@@ -194,11 +194,13 @@ _PROBLEMS = {
     400: "The request itself is broken (`invalid_request`).",
     401: "No API key, or an unknown one (`unauthorized`).",
     404: "There is no such job, or not for this key (`not_found`).",
+    408: "The body stopped coming (`request_timeout`).",
     409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
     410: "Its files have been removed (`job_expired`).",
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
     415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
     416: "No byte of the result is in the range (`range_not_satisfiable`).",
+    421: "This server has no keys and does not answer for that host (`misdirected_request`).",
     422: "A parameter, an option, a key or the cloud is unusable (`invalid_request`, `invalid_options`, "
     "`malformed_file`, `too_few_points`, `invalid_cloud`, `unsupported_cloud`, `idempotency_conflict`).",
     429: "This key has too many requests or jobs (`rate_limited`, `quota_exceeded`); see Retry-After.",
@@ -210,7 +212,7 @@ _PROBLEMS = {
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe problems by status."""
-    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 422, 429})}
+    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 421, 422, 429})}
 
 
 def document_problems(app: FastAPI) -> None:
@@ -225,7 +227,7 @@ def document_problems(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-_INTAKE = (400, 401, 409, 413, 415, 422, 429, 500, 503, 507)
+_INTAKE = (400, 401, 408, 409, 413, 415, 422, 429, 500, 503, 507)
 _JOB: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
 _LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type": "string"}}}
 

@@ -20,7 +20,10 @@ from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 if TYPE_CHECKING:
     from straightpcf.model.filter import Filter
 
-__all__ = ["Cancel", "Done", "Failed", "Preview", "Progress", "Ready", "WorkerSpec", "run_worker"]
+__all__ = ["SERVERS_OWN", "Cancel", "Done", "Failed", "Preview", "Progress", "Ready", "WorkerSpec", "run_worker"]
+
+# Ctrl-C reaches the whole group, and so does what systemd and `timeout` send: the server says when to end.
+SERVERS_OWN = (signal.SIGINT, signal.SIGTERM)
 
 PROGRESS_INTERVAL_SECONDS = 0.05
 # More than a patch on a CPU, more than a batch of patches on a device, so that the usual path is the one that is warm.
@@ -92,9 +95,9 @@ class Failed:
 
 def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
     """Serve jobs until the pipe says None or its other end is gone."""
-    # Ctrl-C reaches the whole group, and so does what systemd and `timeout` send: the server says when to end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in SERVERS_OWN:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SERVERS_OWN)
     try:
         denoiser = _load(spec)
     except StraightPCFError as error:

@@ -9,10 +9,21 @@ from pathlib import Path
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.service.jobs.full_disk import is_full, release_reserve
 
-__all__ = ["open_database"]
+__all__ = ["check_database", "open_database"]
 
 SCHEMA_VERSION = 1
 _BUSY_SECONDS = 30.0
+
+
+def check_database(path: Path) -> None:
+    """Raise what would keep the file from being used; reads all of it, so that once a start is enough."""
+    db = open_database(path)
+    try:
+        (fault,) = db.execute("PRAGMA quick_check(1)").fetchone()
+    finally:
+        db.close()
+    if fault != "ok":
+        raise sqlite3.DatabaseError(f"{path.name} is damaged: {' '.join(fault.split())}")
 
 
 def open_database(path: Path) -> sqlite3.Connection:
@@ -46,9 +57,6 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
     (version,) = db.execute("PRAGMA user_version").fetchone()
     if version > SCHEMA_VERSION:
         raise InvalidOptions(f"{path} is of schema {version}; this straightpcf is older and knows {SCHEMA_VERSION}")
-    (fault,) = db.execute("PRAGMA quick_check(1)").fetchone()
-    if fault != "ok":
-        raise sqlite3.DatabaseError(f"{path.name} is damaged: {' '.join(fault.split())}")
     db.executescript(files(__package__).joinpath("schema.sql").read_text())
     columns = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
     if "deaths" not in columns:  # before versions were counted

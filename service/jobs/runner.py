@@ -65,11 +65,15 @@ class JobRunner:
         for running in [running for running in self._running if running.claim.record.id == id]:
             await running.end("canceled")
 
-    async def stop(self, *, patience_seconds: float) -> None:
-        """Take nothing more, let what runs finish for a while, and put back what did not."""
+    async def stop(self, patience: Callable[[], float]) -> None:
+        """Take nothing more, let what runs finish for a while, and put back what did not.
+
+        patience: says how many seconds of that while are left.
+        """
         self._stopping = True
-        if self._running:
-            await asyncio.wait([running.over for running in self._running], timeout=patience_seconds)
+        while self._running and (left := patience()) > 0:
+            overs = [running.over for running in self._running]
+            await asyncio.wait(overs, timeout=min(left, POLL_SECONDS))
         await asyncio.gather(*(running.end("shutdown") for running in self._running))
         for loop in self._loops:
             loop.cancel()

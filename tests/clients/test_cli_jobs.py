@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,25 @@ def test_denoise_that_is_ended_takes_its_job_along(server: RunningServer, tmp_pa
     process.send_signal(number)
     assert process.wait(timeout=20) == 130
     assert cli(server, "jobs").stdout == b""
+    assert list(tmp_path.iterdir()) == [large]
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.02, 0.2])
+def test_a_second_ctrl_c_is_as_quiet_as_the_first(tmp_path: Path, pause: float) -> None:
+    np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]
+    command += ["--device", "cpu", "--threads", "1"]
+    with subprocess.Popen(command, env=clean_environment(), stderr=subprocess.PIPE) as process:
+        try:
+            wait_for(lambda: list(tmp_path.glob(".clean.*.part.npy")), seconds=60)
+            time.sleep(0.5)
+            while process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                time.sleep(pause or 0.001)
+        finally:
+            process.kill()
+        assert process.stderr is not None
+        assert (process.returncode, process.stderr.read()) == (130, b"")
     assert list(tmp_path.iterdir()) == [large]
 
 

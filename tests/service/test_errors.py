@@ -22,9 +22,9 @@ def test_the_docs_tell_the_status_of_every_code_that_is_sent() -> None:
 
 
 @pytest.mark.parametrize("code", sorted(ERRORS_BY_CODE))
-def test_what_the_caller_did_wrong_is_4xx_and_what_may_be_retried_is_429_or_5xx(code: str) -> None:
+def test_what_the_caller_did_wrong_is_4xx_and_what_may_be_retried_is_408_429_or_5xx(code: str) -> None:
     kind, status = ERRORS_BY_CODE[code], STATUS_BY_CODE[code]
     if issubclass(kind, InvalidRequest):
         assert 400 <= status < 500
     if kind.retryable:
-        assert status in (429, 502, 503, 507)
+        assert status in (408, 429, 502, 503, 507)

@@ -18,7 +18,7 @@ from tests.service.fakes import CONTENT, ObedientBackend
 from tests.service.in_process import serving
 
 CLOUD = b"0 0 0\n" * 50
-POST = b"POST /denoise?filename=a.xyz HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n%b" % (len(CLOUD), CLOUD)
+POST = b"POST /denoise?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n%b" % (len(CLOUD), CLOUD)
 
 
 def play(scenario: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -81,7 +81,7 @@ def test_a_job_that_someone_else_deletes_during_its_download_leaves_the_connecti
             reader, writer = await asyncio.open_connection(host, port)
             writer.write(POST.replace(b"a.xyz", b"a.xyz" + query.encode()))
             assert CONTENT in await _answer(reader)
-            writer.write(b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n")
+            writer.write(b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n")
             assert b'"ok"' in await _answer(reader)
             writer.close()
 

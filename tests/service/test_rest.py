@@ -161,7 +161,7 @@ def test_huge_coordinates_end_in_a_problem_or_in_finite_points(server: RunningSe
     ],
 )
 def test_a_bad_option_is_refused_before_the_body_is_read(server: RunningServer, query: str, word: str) -> None:
-    request = f"POST /denoise?{query} HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
+    request = f"POST /denoise?{query} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n"
     problem = raw(server, request.encode()).problem()
     assert problem["code"] == "invalid_options"
     assert word in problem["detail"]

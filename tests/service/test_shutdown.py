@@ -13,6 +13,7 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.clouds import noisy, torus
 from tests.conftest import run_server
@@ -76,13 +77,31 @@ def test_who_waits_in_vain_is_told_so_before_a_server_ends(tmp_path: Path) -> No
         assert "Traceback" not in server.log.read_text()
 
 
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_second_ctrl_c_ends_at_once_and_quietly_and_the_job_is_queued_again(tmp_path: Path, busy: bool) -> None:
+    np.save(cloud := tmp_path / "cloud.npy", noisy(torus(60_000), 0.01))
+    with run_server(tmp_path, within=("setsid",)) as server:
+        if busy:
+            server.wait_until_ready()
+            subprocess.run(["curl", "-s", "-T", cloud, f"{server.url}/jobs/long?iterations=9"], check=True)
+            wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
+        for _ in range(2):  # as a terminal does: the worker, which may be loading, is in the server's group
+            os.killpg(server.process.pid, signal.SIGINT)
+            time.sleep(0.5 * busy)
+        assert server.process.wait(timeout=10) == 130  # not after the 30 s that work may go on
+        assert "Traceback" not in server.log.read_text()
+        assert len(list(server.data_dir.glob("jobs/*/input"))) == busy
+
+
 def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path: Path) -> None:
     with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "2"}) as server:
         host, port = server.url.removeprefix("http://").split(":")
         forms = (b"", b"Content-Type: multipart/form-data; boundary=b\r\n")
         uploads = [socket.create_connection((host, int(port)), timeout=20) for _ in forms]
         for upload, form in zip(uploads, forms, strict=True):
-            upload.sendall(b"POST /jobs HTTP/1.1\r\nHost: x\r\n" + form + b"Content-Length: 100000\r\n\r\n--b\r\n")
+            upload.sendall(
+                b"POST /jobs HTTP/1.1\r\nHost: localhost\r\n" + form + b"Content-Length: 100000\r\n\r\n--b\r\n"
+            )
         wait_for(lambda: len(list(server.data_dir.glob("incoming/*"))) == 2)
         server.process.send_signal(signal.SIGTERM)
         for upload in uploads:
