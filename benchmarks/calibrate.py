@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument(
         "--mean", type=Path, help="a state trained on from this one: take the mean of both's velocities"
     )
+    parser.add_argument("--share", type=float, default=0.5, help="of the state in that mean, 0..1")
     parser.add_argument("--table", type=Path, help="weights whose table of noise to keep, instead of reading a new one")
     parser.add_argument("--keep", type=Path, help="weights whose DistanceModule and calibration to keep as they are")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
@@ -57,7 +58,8 @@ def main() -> None:
 
     network, progress = read_network(arguments.state)
     if arguments.mean is not None:
-        average_with(network, arguments.mean)
+        average_with(network, arguments.mean, arguments.share)
+        progress["share"] = arguments.share
         progress["mean_with"] = read_network(arguments.mean)[1]
     if arguments.keep is not None:
         take_distance_module(network, arguments.keep)
