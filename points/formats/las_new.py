@@ -22,7 +22,8 @@ FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-_RAW = ("bit_fields", "raw_classification")  # what laspy calls the bytes of bit fields
+# What laspy calls the bytes of bit fields, and parts of its own record: it opens no file with dimensions of these names.
+_RESERVED = ("bit_fields", "raw_classification", "header", "scales", "offsets")
 
 
 def check_new(cloud: PointCloud) -> None:
@@ -62,7 +63,7 @@ def _laid_out(cloud: PointCloud) -> tuple[int, dict[str, npt.NDArray[Any]], dict
     point_format = 2 * has_rgb + has_time
     standard = standard_dimensions(point_format)
     held = {n: values for n, values in columns.items() if n in standard and _fits(values, standard[n])}
-    extra = _extra(columns, held, {*standard, *_RAW})
+    extra = _extra(columns, held, {*standard, *_RESERVED})
     if len(extra) > MAX_EXTRA_DIMENSIONS:
         raise UnsupportedCloud(
             f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"

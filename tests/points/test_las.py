@@ -144,7 +144,7 @@ def test_attributes_whose_long_names_begin_alike_all_come_back(tmp_path: Path) -
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_attributes_with_names_of_dimensions_are_put_there_or_beside_them(suffix: str, tmp_path: Path) -> None:
-    """laspy opens no file in which an extra dimension is called as a standard one, bit fields included."""
+    """laspy opens no file in which an extra dimension is called as a standard one, or as a part of its own record."""
     held: dict[str, npt.NDArray[Any]] = {
         "intensity": np.arange(N, dtype=np.float32) * 1300,
         "return_number": np.arange(N) % 8,
@@ -160,6 +160,9 @@ def test_attributes_with_names_of_dimensions_are_put_there_or_beside_them(suffix
         "key_point": np.full(N, 2, np.uint8),
         "synthetic": np.linspace(0, 1, N),
         "bit_fields": np.arange(N, dtype=np.uint8),
+        "header": np.linspace(0, 1, N),
+        "scales": np.linspace(0, 2, N),
+        "offsets": np.linspace(0, 3, N),
     }
     write_cloud(PointCloud(torus(N), held | beside), tmp_path / f"a.{suffix}", format_named(suffix))
     theirs = laspy.read(tmp_path / f"a.{suffix}")
