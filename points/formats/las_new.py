@@ -22,7 +22,7 @@ FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-# What laspy calls the bytes of bit fields, and parts of its own record: it opens no file with dimensions of these names.
+# What laspy calls the bytes of bit fields, and parts of its own record: it opens no file with such dimensions.
 _RESERVED = ("bit_fields", "raw_classification", "header", "scales", "offsets")
 
 
