@@ -1,0 +1,250 @@
+"""One cloud on its way through the filter, pass after pass, and what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.model.distinct import Distinct
+from straightpcf.model.noise import NoiseReader, Reading
+from straightpcf.model.normalize import CloudFrame, patch_scales
+from straightpcf.model.outliers import FAR_OUT, far_out, isolated
+from straightpcf.model.patches import Patches
+from straightpcf.model.restraint import made_of, reaches
+from straightpcf.model.spacing import Lie
+from straightpcf.model.tiles import Tiling, split
+from straightpcf.points.errors import InvalidCloud, TooFewPoints
+from straightpcf.points.options import DenoiseOptions
+
+if TYPE_CHECKING:
+    from straightpcf.model.filter import Filter
+
+__all__ = ["MIN_POINTS", "DenoiseResult", "FinishedPatch", "Run"]
+
+MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
+# Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/filter.md, "Few points").
+_FEW_POINTS = 500
+_FEWEST_APART = 100  # points among which one may lie apart
+_EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
+
+
+@dataclass(frozen=True)
+class FinishedPatch:
+    """Points whose position in this pass is settled: no other patch of the pass changes them. There may be none.
+
+    indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
+    final: whether this is known to be the last pass, which `auto` finds out only afterwards;
+    progress: 0..1, of the whole job as far as it can be foreseen; it never falls.
+    """
+
+    indices: npt.NDArray[np.int64]
+    xyz: npt.NDArray[np.float64]
+    iteration: int
+    final: bool
+    progress: float
+
+
+@dataclass(frozen=True)
+class DenoiseResult:
+    """The filtered cloud and how it came about.
+
+    xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
+    distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not finite,
+    or so far out or alone that they belong to nothing, and passed through.
+    """
+
+    xyz: npt.NDArray[np.float64]
+    iterations: int
+    noise_before: float
+    noise_after: float
+    distances: tuple[float, ...]
+    untouched: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+
+class Run:
+    """One cloud on its way through the filter."""
+
+    def __init__(self, owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> None:
+        self.filter, self.options, self.xyz = owner, options, (xyz := _numbers(points))
+        self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        self.not_finite = len(xyz) - len(self.rows)
+        self.rows = self.rows[~far_out(self._of_rows())]
+        self.far_out = len(xyz) - self.not_finite - len(self.rows)
+        if len(self.rows) < MIN_POINTS:
+            others = f"{self.not_finite} not finite, {self.far_out} far out"
+            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
+        self._take()
+        apart = self._apart()
+        self.apart = int(apart.sum())
+        if self.apart:
+            self.rows = self.rows[~apart]
+            self._take()
+        self.iterations, self._progress = 0, 0.0
+        self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
+        self.held = np.zeros(len(self.moved), dtype=bool)
+        self.readings: list[Reading] = []  # before each pass, and after the last
+        self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
+
+    def _of_rows(self) -> npt.NDArray[np.float64]:
+        """Return the rows that are filtered, without a copy where they are all."""
+        return self.xyz if len(self.rows) == len(self.xyz) else self.xyz[self.rows]
+
+    def _take(self) -> None:
+        cloud = self._of_rows()
+        self.frame = CloudFrame.of(cloud)
+        self.points = Distinct(cloud)
+
+    def _apart(self) -> npt.NDArray[np.bool_]:
+        """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
+        if self.frame.radius == 0.0 or not _FEWEST_APART <= len(self.points.xyz) <= self.filter.tile_points:
+            return np.zeros(len(self.rows), dtype=bool)
+        apart = isolated(self.frame.enter(self.points.xyz), workers=self.filter.threads)
+        return apart[self.points.inverse]
+
+    def patches(self) -> Iterator[FinishedPatch]:
+        """Run pass after pass."""
+        if self.frame.radius == 0.0:
+            return
+        planned = None if self.options.iterations == "auto" else self.options.iterations
+        tiles = split(self.points.xyz, self.filter.tile_points)
+        tiling: Tiling | None = None
+        while True:
+            here = self.frame.enter(self.points.xyz)
+            here += self.moved
+            evened = self._evened(here, tiling, planned)
+            here += evened
+            tiling = self._tiling(here, tiles)
+            self.readings.append(self.reader.read(here, tiling, self.readings[0] if self.readings else None))
+            left = self._passes_left(planned)
+            if left == 0:
+                return
+            self.iterations += 1
+            self.moved += evened
+            yield from self._pass(here, tiling, left)
+
+    def result(self, seconds: float) -> DenoiseResult:
+        """Put the moved rows back among the others."""
+        out = self.xyz.copy()
+        out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
+        untouched = len(out) - len(self.rows)
+        warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
+        if self.far_out:
+            farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
+            warnings.append(f"{self.far_out} points are {farther} and were passed through")
+        if self.apart:
+            warnings.append(f"{self.apart} points lie apart from all others and were passed through")
+        if held := np.count_nonzero(self.held[self.points.inverse]):
+            warnings.append(f"{held} points are on walls closer together than points are, and were held back")
+        if self.frame.radius == 0.0:
+            warnings.append("all points coincide: nothing to filter")
+        elif len(self.points.xyz) < _FEW_POINTS:
+            warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
+        noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
+        return DenoiseResult(
+            out, self.iterations, noise[0], noise[-1], self.distances, untouched, seconds, tuple(warnings)
+        )
+
+    @property
+    def distances(self) -> tuple[float, ...]:
+        """The DistanceModule's median before each pass and after the last."""
+        return tuple(reading.distance for reading in self.readings)
+
+    def _passes_left(self, planned: int | None) -> int:
+        if planned is not None:
+            return planned - self.iterations
+        if len(self.points.xyz) < _FEW_POINTS:
+            return 1 - self.iterations
+        return self.filter.calibration.passes_left(self.distances, self.readings[0].noise_in_radii)
+
+    def _evened(
+        self, here: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
+    ) -> npt.NDArray[np.float64] | float:
+        """Return how points go along the surface before the pass that comes, (N, 3); tiling: the last pass's.
+
+        Not before the first, nor where chance laid them, or a scanner: scan lines are no clumps. d is read of the
+        points so spread, also where no pass comes after.
+        """
+        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].lie.scattered:
+            return 0.0
+        return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
+
+    def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
+        begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all
+        shown = self.readings[-1]
+        settled, whole = 0, len(shown.parts) * len(here)
+        steps = [np.zeros_like(here) for _ in shown.parts[1:]]  # all but the last, which is settled as it comes
+        # The patches are cut from `here`, so results may be written into self.moved as they come.
+        for number, cut in self._cuts(here, tiling, shown.parts):
+            scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
+            probed, believed = shown.probed, None
+            if shown.scene and self.filter.zoom:
+                probed, believed = self._believed(here, cut, scales)
+            made = partial(self._made, here, cut, scales, shown.lie, believed)
+            for owned, step, held in self.filter.processor.displacements(here, cut, scales, probed, made):
+                self.held[owned] |= held
+                settled += len(owned)
+                if number < len(steps):
+                    steps[number][owned], owned = step, owned[:0]
+                else:
+                    self.moved[owned] += np.mean([step, *(other[owned] for other in steps)], axis=0)
+                copies = self.points.copies(owned)
+                indices = self.rows[copies]
+                moved = self.moved[self.points.inverse[copies]]
+                xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
+                self._progress = begun_at + settled / whole * share
+                yield FinishedPatch(indices, xyz, self.iterations, left == 1, self._progress)
+
+    def _made(
+        self,
+        here: npt.NDArray[np.float64],
+        cut: Patches,
+        scales: npt.NDArray[np.float64],
+        lie: Lie,
+        believed: npt.NDArray[np.float64] | None,
+        patch: int,
+        displacement: npt.NDArray[np.float64],
+    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], bool]:
+        """Return the points that a patch owns, their step, and whether it was held back; on any thread."""
+        owned, step = cut.owned_points(patch), displacement / scales[patch]
+        if not self.filter.zoom:
+            return owned, step, False
+        limit = None if believed is None else believed[patch]
+        return owned, *made_of(step, self.moved[owned], here[cut.index[patch]], lie=lie, believed=limit)
+
+    def _believed(
+        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]
+    ) -> tuple[dict[int, float], npt.NDArray[np.float64]]:
+        """Return what the DistanceModule says of a scene's patches, by number, and the noise std believed of each."""
+        distances = self.filter.processor.distances(here, cut, scales)
+        noise = self.reader.noise_stds(distances, scales)
+        return dict(enumerate(distances.tolist())), reaches(here, cut, noise, self.readings[0].usual)
+
+    def _cuts(
+        self, here: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]
+    ) -> Iterator[tuple[int, Patches]]:
+        """Cut a pass once for each of some numbers of parts: the whole cloud, or part after part."""
+        for number, count in enumerate(parts):
+            if count == 1:
+                yield from ((number, cut) for cut in tiling.cuts())
+                continue
+            for rows in tiling.parted(count):
+                yield from ((number, cut.of_rows(rows)) for cut in self._tiling(here[rows]).cuts())
+
+    def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
+        owner = self.filter
+        tiles = tiles or split(xyz, owner.tile_points)
+        return Tiling(xyz, tiles, coverage=owner.coverage, seed=self.options.seed, device=owner.device)
+
+
+def _numbers(xyz: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    array = np.asarray(xyz)
+    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
+        raise InvalidCloud(f"points must be (N, 3) numbers, got {array.shape} {array.dtype}")
+    return array.astype(np.float64, copy=False)
