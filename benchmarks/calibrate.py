@@ -55,12 +55,13 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
     arguments = parser.parse_args()
+    if arguments.keep is not None and (arguments.distance or arguments.table or arguments.traces):
+        parser.error("--keep takes all from one file and measures nothing: no --distance, --table or --traces with it")
 
     network, progress = read_network(arguments.state)
     if arguments.mean is not None:
-        average_with(network, arguments.mean, arguments.share)
+        progress["mean_with"] = average_with(network, arguments.mean, arguments.share)
         progress["share"] = arguments.share
-        progress["mean_with"] = read_network(arguments.mean)[1]
     if arguments.keep is not None:
         take_distance_module(network, arguments.keep)
         _write(network, progress, Calibration.from_metadata(read_checkpoint(arguments.keep)[1]), arguments.out)

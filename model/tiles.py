@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from straightpcf.model.device_patches import cut_patches_on
 from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches, patches_around
 
-__all__ = ["Tiling", "parted", "split"]
+__all__ = ["Tiling", "split"]
 
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
@@ -38,14 +38,6 @@ def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np
         order = np.argpartition(xyz[rows, axis], middle)
         left += [rows[order[middle:]], rows[order[:middle]]]
     return tiles
-
-
-def parted(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]], parts: int) -> list[npt.NDArray[np.int64]]:
-    """Part (N, 3) points into clouds of N / parts rows, ascending, each as evenly spread as the whole.
-
-    Points are dealt out in the order of a k-d tree's leaves, where neighbours follow one another; tile by tile.
-    """
-    return _dealt(_by_leaves(xyz, tiles), parts)
 
 
 class Tiling:
@@ -79,12 +71,16 @@ class Tiling:
         return self._cut(self._xyz)
 
     def parted(self, parts: int) -> list[npt.NDArray[np.int64]]:
-        """Do what `parted` does for the pass's points; a tree of them is built once, however often it is asked."""
-        return _dealt(self._ordered, parts)
+        """Part the pass's points into clouds of N / parts rows, ascending, each as evenly spread as the whole.
+
+        Points are dealt out in the order of a k-d tree's leaves, where neighbours follow one another; tile by tile.
+        """
+        return [np.sort(np.concatenate([rows[part::parts] for rows in self._by_leaves])) for part in range(parts)]
 
     @cached_property
-    def _ordered(self) -> list[npt.NDArray[np.int64]]:
-        return _by_leaves(self._xyz, self.tiles)
+    def _by_leaves(self) -> list[npt.NDArray[np.int64]]:
+        """The tiles' rows in that order: of one tree, however often a pass is parted."""
+        return [rows[cKDTree(self._xyz[rows]).indices] for rows in self.tiles]
 
     def probes(self, count: int = _PROBES) -> tuple[Patches, range]:
         """Return about `count` patches spread over the cloud, to look at, and which of the whole cut they are."""
@@ -123,14 +119,6 @@ class Tiling:
             self.probes()
         for core, margin in zip(self.tiles, self._margins, strict=True):
             yield np.concatenate([core, _halo(self._xyz, core, margin)]), len(core)
-
-
-def _by_leaves(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]) -> list[npt.NDArray[np.int64]]:
-    return [rows[cKDTree(xyz[rows]).indices] for rows in tiles]
-
-
-def _dealt(ordered: list[npt.NDArray[np.int64]], parts: int) -> list[npt.NDArray[np.int64]]:
-    return [np.sort(np.concatenate([rows[part::parts] for rows in ordered])) for part in range(parts)]
 
 
 def _halo(xyz: npt.NDArray[np.float64], core: npt.NDArray[np.int64], margin: float) -> npt.NDArray[np.int64]:

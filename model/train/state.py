@@ -95,17 +95,19 @@ def take_distance_module(network: StraightPCF, path: Path) -> None:
     network.distance_module.load_state_dict(read_network(path)[0].distance_module.state_dict())
 
 
-def average_with(network: StraightPCF, path: Path, share: float = 0.5) -> None:
+def average_with(network: StraightPCF, path: Path, share: float = 0.5) -> dict[str, Any]:
     """Replace a network's velocities by the mean of theirs, which have that share, and those of a state of their chain.
 
     Such means keep some of what each is better at (Wortsman et al. 2022, "Model soups"). BatchNorm's statistics are
-    averaged too: settled runs leave them as they were.
+    averaged too: settled runs leave them as they were. Returns that state's progress.
     """
-    theirs = read_network(path)[0].velocity_modules.state_dict()
+    other, progress = read_network(path)
+    theirs = other.velocity_modules.state_dict()
     ours = network.velocity_modules.state_dict()
     network.velocity_modules.load_state_dict(
         {name: torch.lerp(t, theirs[name], 1 - share) if t.is_floating_point() else t for name, t in ours.items()}
     )
+    return progress
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

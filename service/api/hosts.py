@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from straightpcf.points.errors import MisdirectedRequest
-from straightpcf.service.api.errors import problem_response
+from straightpcf.service.api.errors import STATUS_BY_CODE, problem_response
 
 __all__ = ["HostMiddleware", "is_loopback"]
 
@@ -42,7 +42,7 @@ class HostMiddleware:
             f"this server has no keys and does not answer for {host[:80]!r}: ask for localhost, or name it in "
             "STRAIGHTPCF_ALLOWED_HOSTS"
         )
-        await problem_response(Request(scope), error, 421)(scope, receive, send)
+        await problem_response(Request(scope), error, STATUS_BY_CODE[error.code])(scope, receive, send)
 
 
 def _name_in(host: str) -> str:

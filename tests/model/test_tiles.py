@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from straightpcf.model import tiles as model_tiles
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.spread import spread
-from straightpcf.model.tiles import Tiling, parted, split
+from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, torus
@@ -27,12 +28,16 @@ def test_every_row_is_in_one_tile_and_none_is_too_large(count: int, tile_points:
     assert max(map(len, tiles)) <= tile_points
 
 
+def tiling_of(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]) -> Tiling:
+    return Tiling(xyz, tiles, coverage=3, seed=0)
+
+
 @settings(max_examples=25, deadline=None)
 @given(count=st.integers(1, 3000), tile_points=st.integers(100, 3000), parts=st.integers(1, 6), equal=st.booleans())
 def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, equal: bool) -> None:
     xyz = np.zeros((count, 3)) if equal else torus(count)
     tiles = split(xyz, tile_points)
-    rows = parted(xyz, tiles, parts)
+    rows = tiling_of(xyz, tiles).parted(parts)
     assert np.array_equal(np.sort(np.concatenate(rows)), np.arange(count))
     assert max(map(len, rows)) - min(map(len, rows)) <= len(tiles)
     assert all((np.diff(part) > 0).all() for part in rows)
@@ -40,8 +45,8 @@ def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, e
 
 def test_a_pass_that_is_parted_again_builds_no_second_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = torus(3000)
-    tiling = Tiling(xyz, tiles := split(xyz, 1000), coverage=3, seed=0)
-    expected = [parted(xyz, tiles, parts) for parts in (1, 2, 5)]
+    tiling = tiling_of(xyz, tiles := split(xyz, 1000))
+    expected = [tiling_of(xyz, tiles).parted(parts) for parts in (1, 2, 5)]
     built: list[int] = []
     monkeypatch.setattr(model_tiles, "cKDTree", lambda points: built.append(len(points)) or cKDTree(points))
     for parts, rows in zip((1, 2, 5), expected, strict=True):
@@ -51,7 +56,7 @@ def test_a_pass_that_is_parted_again_builds_no_second_tree(monkeypatch: pytest.M
 
 def test_parts_are_as_evenly_spread_as_the_whole() -> None:
     xyz = torus(12_000)
-    for part in parted(xyz, split(xyz, 4000), 3):
+    for part in tiling_of(xyz, split(xyz, 4000)).parted(3):
         alone = cKDTree(xyz[part])
         among = [len(near) for near in alone.query_ball_point(xyz[::50], 0.15)]
         of_all = [len(near) for near in cKDTree(xyz).query_ball_point(xyz[::50], 0.15)]
