@@ -1,13 +1,15 @@
 """How much of a step the network asks for is made: what is more than the noise is not.
 
-The points of a scene go no farther than its noise reaches, and not along a surface, nor do those of an object that lie
-on it by chance. Those of a quiet object go less far (`quiet`), and where walls would be joined none goes (`walls`).
+The points of a scene go no farther than its noise reaches, not off the line that they lie in, and not along a surface,
+nor do those of an object that lie on it by chance. Those of a quiet object go less far (`quiet`), and where walls would
+be joined none goes (`walls`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from straightpcf.model.neighbourhoods import neighbourhoods
 from straightpcf.model.patches import Patches
@@ -15,7 +17,7 @@ from straightpcf.model.quiet import tempered
 from straightpcf.model.spacing import Lie
 from straightpcf.model.walls import share_between_walls
 
-__all__ = ["across", "made_of", "reaches", "restrained"]
+__all__ = ["across", "held_to_lines", "made_of", "reaches", "restrained"]
 
 # In noise stds: moves up to the first are made whole, from the last on none is (docs/filter.md, "How far ...").
 _WHOLE, _NONE = 3.0, 4.0
@@ -30,6 +32,9 @@ _HELD = 0.5  # of a step; where less is left between walls, that is said
 # stds along the plane are as 1 : 10 or less; from 1 : 5 on it is none.
 _AROUND = 24
 _FLAT, _ROUND, _LINE = 0.15, 0.3, 0.1
+# So many neighbours lie in a line where the greater of their stds across it is a tenth of that along it, and in none
+# from a fifth on. A mean and the line's way take three of them.
+_IN_LINE, _THIN, _WIDE, _TAKEN = 8, 0.1, 0.2, 3
 
 
 def made_of(
@@ -48,7 +53,7 @@ def made_of(
     if len(step) == 0:
         return step, False
     if believed is not None:
-        step = restrained(moved, step, believed)
+        step = held_to_lines(restrained(moved, step, believed), around)
     share = share_between_walls(step, around) if lie.walls else 1.0
     if share < 1:
         step = share * step
@@ -83,6 +88,29 @@ def restrained(
     distance = np.linalg.norm(moved + step, axis=1)
     weight = np.clip((_NONE - distance / max(noise_std, 1e-300)) / (_NONE - _WHOLE), 0.0, 1.0)
     out: npt.NDArray[np.float64] = step * weight[:, None]
+    return out
+
+
+def held_to_lines(step: npt.NDArray[np.float64], around: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return a step (n, 3), less of what goes off the line that points lie in, where they do.
+
+    around: (P, 3), a patch, of which the first n >= 1 points make the step. A wire, a railing or the edge of a ledge is
+    a line of points near a wall, to which the network draws them. How they scatter about their line is their noise n;
+    of moves m off it a share of n^2 / m^2 leaves least error (Wiener's weight).
+    """
+    points = around[: len(step)]
+    near = neighbourhoods(points, around, _IN_LINE)
+    least, less, most = np.maximum(near.variances, 0.0).T
+    in_line = np.clip((_WIDE - np.sqrt(less / np.maximum(most, 1e-300))) / (_WIDE - _THIN), 0, 1) * (most > 0)
+    if not in_line.any():
+        return step
+    way = near.axes[:, :, 2]
+    off = step - (step * way).sum(axis=1, keepdims=True) * way
+    noise = (least + less) / max(1, near.local.shape[1] - _TAKEN)
+    _, beside = cKDTree(points).query(points, k=np.arange(1, min(_IN_LINE, len(points)) + 1))
+    moves = np.square(off).sum(axis=1)[beside].mean(axis=1)
+    kept = in_line * (1 - np.minimum(1.0, noise / np.maximum(moves, 1e-300)))
+    out: npt.NDArray[np.float64] = step - off * kept[:, None]
     return out
 
 

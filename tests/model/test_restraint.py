@@ -8,7 +8,7 @@ import pytest
 from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import across, reaches, restrained
+from straightpcf.model.restraint import across, held_to_lines, reaches, restrained
 from straightpcf.model.spacing import Lie
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
@@ -67,6 +67,27 @@ def test_where_there_is_no_surface_a_step_stays_as_it_is() -> None:
 
 def sheet_of(count: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1, 1, (count, 3)) * [1, 1, 0]
+
+
+def test_a_line_of_points_goes_off_it_no_farther_than_it_scatters() -> None:
+    rng = np.random.default_rng(0)
+    wire = np.stack([np.linspace(-1, 1, 60), *rng.normal(0, 0.002, (2, 60))], axis=1)
+    wall = sheet_of(940) + np.array([0, 0, 0.5])
+    drawn = np.tile([0.05, 0.0, 0.1], (60, 1))
+    left = held_to_lines(drawn, np.concatenate([wire, wall]))
+    np.testing.assert_allclose(left[:, 0], 0.05, atol=0.003)  # along it all is made
+    assert np.abs(left[:, 2]).max() < 3 * 0.002
+    back = -wire * [0, 1, 1]
+    denoised = held_to_lines(back, np.concatenate([wire, wall]))
+    assert np.linalg.norm(denoised) > 0.9 * np.linalg.norm(back)
+
+
+def test_what_is_no_line_is_not_held_to_one() -> None:
+    rng = np.random.default_rng(0)
+    step = rng.normal(0, 0.1, (400, 3))
+    assert np.mean(np.linalg.norm(held_to_lines(step, sheet_of(1000)) - step, axis=1) > 1e-9) < 0.05
+    np.testing.assert_array_equal(held_to_lines(step[:20], np.zeros((33, 3))), step[:20])
+    assert np.isfinite(held_to_lines(step[:1], sheet_of(33))).all()
 
 
 def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
