@@ -1,6 +1,7 @@
-"""Training clouds made in code: solids as a scanner sees them, from one side, along the beams of a raster.
+"""Training clouds made in code: solids or places as a scanner sees them, from one side, along the beams of a raster.
 
 python -m straightpcf.model.train.scanned scanned.npz --count 36
+python -m straightpcf.model.train.scanned places.npz --places --count 36
 
 A depth camera, a laser scanner or a height raster measures along beams: its points lie on rows and columns, and its
 noise along the beams only. A denoiser that has never seen that takes such noise for two sheets of a thin wall.
@@ -9,6 +10,8 @@ noise along the beams only. A denoiser that has never seen that takes such noise
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import fpsample
@@ -18,22 +21,43 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.train.solids import FAMILIES
+from straightpcf.model.train.bodies import Body
+from straightpcf.model.train.places import PLACES, Place
+from straightpcf.model.train.solids import FAMILIES, Solid
 
-__all__ = ["COUNTS", "Scanner", "write_scanned"]
+__all__ = ["COUNTS", "SCANNED_PLACES", "SCANNED_SOLIDS", "Scanned", "Scanner", "write_scanned"]
 
 Floats = npt.NDArray[np.float64]
 
 COUNTS = (5_000, 12_000, 30_000)  # points of a shape's clouds, about; one side of a solid has half of its surface
-_DENSE = 500_000  # points of a solid that its scan is made from
-_SURFACE = 50_000
-_DISTANCE = (2.5, 40.0)  # from the centre of a solid, in radii
 _ASPECT = (1.0, 5.0)  # of the steps from row to row and along a row
 _SLANTED = 0.25  # cosine below which a surface returns nothing
 _PILOT = 128  # beams a side of the raster that tells how fine it has to be
 # Around a beam the nearest sample within a mean spacing is on the surface that it meets, unless another within 2.5
 # lies in front; where surfaces are steep, what is in front by less than the slant allows is the same one.
 _NEAR, _FRONT = 1.0, 2.5
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """What is scanned, and how finely.
+
+    name: what its arrays are called; families: made in turn, with the way (3,) to the scanner where not all will do;
+    dense: samples that a scan is made from, of which `surface` are kept as its surface; distance: how far the scanner
+    is from the centre, in radii; stream: of random numbers.
+    """
+
+    name: str
+    families: Sequence[Callable[[np.random.Generator], Solid | Body | Place]]
+    dense: int
+    surface: int
+    distance: tuple[float, float]
+    stream: int
+
+
+SCANNED_SOLIDS = Scanned("scanned", FAMILIES, 500_000, 50_000, (2.5, 40.0), stream=1)
+# What is thin in places asks for more samples.
+SCANNED_PLACES = Scanned("place", PLACES, 1_000_000, 80_000, (1.3, 15.0), stream=2)
 
 
 class Scanner:
@@ -92,29 +116,32 @@ class Scanner:
         return met
 
 
-def write_scanned(path: Path, count: int, *, seed: int = 0) -> None:
-    """Write an .npz of `count` solids, each scanned at `COUNTS`: `scanned<number>/<points>`, float32, as PUNet's are.
+def write_scanned(path: Path, count: int, *, seed: int = 0, what: Scanned = SCANNED_SOLIDS) -> None:
+    """Write an .npz of `count` solids or places, each scanned at `COUNTS`: `<name><number>/<points>`, float32.
 
-    With them `scanned<number>/eye`, (3,), the place that the beams come from, and the whole surface with its normals,
-    `scanned<number>/surface` and `/normals`, (50 000, 3). All in the frame where the solid's bounding sphere has
-    radius 1.
+    With them `<name><number>/eye`, (3,), the place that the beams come from, and the whole surface with its normals,
+    `<name><number>/surface` and `/normals`, (M, 3). All in the frame where the bounding sphere has radius 1.
     """
     arrays: dict[str, npt.NDArray[np.generic]] = {}
     for number in range(count):
-        rng = np.random.default_rng([seed, number, 1])
-        xyz, normals = FAMILIES[number % len(FAMILIES)](rng).sample(rng, _DENSE)
+        name = f"{what.name}{number:03d}"
+        rng = np.random.default_rng([seed, number, what.stream])
+        made = what.families[number % len(what.families)](rng)
+        solid, way = made if isinstance(made, tuple) else (made, None)
+        xyz, normals = solid.sample(rng, what.dense)
         xyz = CloudFrame.of(xyz).enter(xyz)
-        way = rng.standard_normal(3)
-        eye = way / np.linalg.norm(way) * np.exp(rng.uniform(*np.log(_DISTANCE)))
+        if way is None:
+            way = rng.standard_normal(3)
+        eye = way / np.linalg.norm(way) * np.exp(rng.uniform(*np.log(what.distance)))
         scanner = Scanner(xyz, normals, eye, rng.uniform(0, 2 * np.pi))
         for wanted in COUNTS:
             aspect = np.exp(rng.uniform(*np.log(_ASPECT))) if rng.random() < 0.5 else 1.0
             points = scanner.raster(rng, wanted, aspect, shifted=bool(rng.random() < 0.3))
-            arrays[f"scanned{number:03d}/{len(points)}"] = points.astype(np.float32)
-        kept = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), _SURFACE, 7, 0)
-        arrays[f"scanned{number:03d}/surface"] = xyz[kept].astype(np.float32)
-        arrays[f"scanned{number:03d}/normals"] = normals[kept].astype(np.float32)
-        arrays[f"scanned{number:03d}/eye"] = eye.astype(np.float32)
+            arrays[f"{name}/{len(points)}"] = points.astype(np.float32)
+        kept = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), what.surface, 7, 0)
+        arrays[f"{name}/surface"] = xyz[kept].astype(np.float32)
+        arrays[f"{name}/normals"] = normals[kept].astype(np.float32)
+        arrays[f"{name}/eye"] = eye.astype(np.float32)
     np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
 
@@ -123,5 +150,7 @@ if __name__ == "__main__":
     parser.add_argument("path", type=Path)
     parser.add_argument("--count", type=int, default=36)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--places", action="store_true", help="pieces of streets, rooms, roofs, trees and masts")
     options = parser.parse_args()
-    write_scanned(options.path, options.count, seed=options.seed)
+    what = SCANNED_PLACES if options.places else SCANNED_SOLIDS
+    write_scanned(options.path, options.count, seed=options.seed, what=what)

@@ -22,7 +22,19 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.bodies import Body, carving, creature
 
-__all__ = ["FAMILIES", "RESOLUTIONS", "Box", "Cylinder", "Ellipsoid", "Ring", "Solid", "write_solids"]
+__all__ = [
+    "FAMILIES",
+    "RESOLUTIONS",
+    "Box",
+    "Cylinder",
+    "Ellipsoid",
+    "Primitive",
+    "Ring",
+    "Solid",
+    "along",
+    "pose",
+    "write_solids",
+]
 
 Floats = npt.NDArray[np.float64]
 Samples = tuple[Floats, Floats]  # points (N, 3) and their unit normals (N, 3)
@@ -35,7 +47,7 @@ _WALL = (0.05, 0.25)  # thickness, in a frame where solids have a radius of abou
 
 
 @dataclass(frozen=True)
-class _Primitive(ABC):
+class Primitive(ABC):
     """A simple body in a pose of its own."""
 
     centre: Floats = field(default_factory=lambda: np.zeros(3))
@@ -58,7 +70,7 @@ class _Primitive(ABC):
 
 
 @dataclass(frozen=True)
-class Box(_Primitive):
+class Box(Primitive):
     """half: (3,) half its sides."""
 
     half: Floats = field(default_factory=lambda: np.ones(3))
@@ -79,7 +91,7 @@ class Box(_Primitive):
 
 
 @dataclass(frozen=True)
-class Cylinder(_Primitive):
+class Cylinder(Primitive):
     """Of a radius and half a height, along its z axis."""
 
     radius: float = 1.0
@@ -120,7 +132,7 @@ class Ring(Cylinder):
 
 
 @dataclass(frozen=True)
-class Ellipsoid(_Primitive):
+class Ellipsoid(Primitive):
     """half: (3,) its semi-axes."""
 
     half: Floats = field(default_factory=lambda: np.ones(3))
@@ -143,8 +155,8 @@ class Ellipsoid(_Primitive):
 class Solid:
     """A union of parts less a union of holes."""
 
-    parts: Sequence[_Primitive]
-    holes: Sequence[_Primitive] = ()
+    parts: Sequence[Primitive]
+    holes: Sequence[Primitive] = ()
 
     def contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
         """Say which points (N, 3) are inside: (N,)."""
@@ -170,7 +182,7 @@ class Solid:
         return np.concatenate(points), np.concatenate(normals)
 
     @staticmethod
-    def _in_any(xyz: Floats, bodies: Sequence[_Primitive]) -> npt.NDArray[np.bool_]:
+    def _in_any(xyz: Floats, bodies: Sequence[Primitive]) -> npt.NDArray[np.bool_]:
         held = np.zeros(len(xyz), dtype=bool)
         for body in bodies:
             held |= body.contains(xyz)
@@ -208,14 +220,14 @@ def _wall(rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(*np.log(_WALL))))
 
 
-def _axes(rng: np.random.Generator, z: int) -> Floats:
+def pose(rng: np.random.Generator, z: int) -> Floats:
     """Return a pose whose z axis is one of the three, off by a little: no two faces shall coincide."""
     turn = np.roll(np.eye(3), z + 1, axis=1)
     small: Floats = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
     return small @ turn
 
 
-def _along(direction: Floats) -> Floats:
+def along(direction: Floats) -> Floats:
     """Return a pose whose z axis points along `direction`."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(z, [1.0, 0, 0] if abs(z[0]) < 0.9 else [0, 1.0, 0])
@@ -225,13 +237,13 @@ def _along(direction: Floats) -> Floats:
 
 def _bracket(rng: np.random.Generator) -> Solid:
     """Two to four plates at right angles, with round holes."""
-    parts: list[_Primitive] = []
-    holes: list[_Primitive] = []
+    parts: list[Primitive] = []
+    holes: list[Primitive] = []
     for _ in range(rng.integers(2, 5)):
         axis = int(rng.integers(3))
         half = rng.uniform(0.5, 1.3, 3)
         half[2] = _wall(rng) / 2
-        turn, centre = _axes(rng, axis), rng.uniform(-0.7, 0.7, 3)
+        turn, centre = pose(rng, axis), rng.uniform(-0.7, 0.7, 3)
         parts.append(Box(centre, turn, half))
         for _ in range(rng.integers(0, 4)):
             place = centre + turn @ (rng.uniform(-0.8, 0.8, 3) * half * [1, 1, 0])
@@ -244,19 +256,19 @@ def _fins(rng: np.random.Generator) -> Solid:
     thick, gap = _wall(rng), rng.uniform(0.1, 0.5)
     count = int(np.clip(2.4 / (thick + gap), 3, 12))
     width = count * (thick + gap) / 2
-    parts: list[_Primitive] = [Box(np.zeros(3), np.eye(3), np.array([width, rng.uniform(0.6, 1.4), _wall(rng) / 2]))]
+    parts: list[Primitive] = [Box(np.zeros(3), np.eye(3), np.array([width, rng.uniform(0.6, 1.4), _wall(rng) / 2]))]
     for place in np.linspace(-width + thick, width - thick, count):
         half = np.array([thick / 2, rng.uniform(0.4, 1.2), rng.uniform(0.3, 0.8)])
-        parts.append(Box(np.array([place, 0, half[2]]) + rng.normal(0, 0.01, 3), _axes(rng, 2), half))
+        parts.append(Box(np.array([place, 0, half[2]]) + rng.normal(0, 0.01, 3), pose(rng, 2), half))
     return Solid(parts)
 
 
 def _pipes(rng: np.random.Generator) -> Solid:
     """One to three tubes that cross, with flanges."""
-    parts: list[_Primitive] = []
-    holes: list[_Primitive] = []
+    parts: list[Primitive] = []
+    holes: list[Primitive] = []
     for axis in rng.permutation(3)[: rng.integers(1, 4)]:
-        turn, centre = _axes(rng, int(axis)), rng.normal(0, 0.1, 3)
+        turn, centre = pose(rng, int(axis)), rng.normal(0, 0.1, 3)
         radius, half, wall = rng.uniform(0.25, 0.7), rng.uniform(0.9, 1.6), _wall(rng)
         parts.append(Cylinder(centre, turn, radius, half))
         holes.append(Cylinder(centre, turn, max(0.3 * radius, radius - wall), half + 0.1))
@@ -272,18 +284,18 @@ def _shell(rng: np.random.Generator) -> Solid:
     """A hollow box, cylinder or ellipsoid, open at one side, some with windows."""
     half, wall = rng.uniform(0.6, 1.3, 3), _wall(rng)
     kind = rng.integers(3)
-    body: _Primitive
-    hollow: _Primitive
+    body: Primitive
+    hollow: Primitive
     if kind == 0:
         body, hollow = Box(half=half), Box(half=half - wall)
     elif kind == 1:
         body, hollow = Cylinder(radius=half[0], half=half[2]), Cylinder(radius=half[0] - wall, half=half[2] - wall)
     else:
         body, hollow = Ellipsoid(half=half), Ellipsoid(half=half - wall)
-    holes = [hollow, Box(np.array([0, 0, 2 + rng.uniform(0.1, 0.7) * half[2]]), _axes(rng, 2), np.full(3, 2.0))]
+    holes = [hollow, Box(np.array([0, 0, 2 + rng.uniform(0.1, 0.7) * half[2]]), pose(rng, 2), np.full(3, 2.0))]
     for _ in range(rng.integers(0, 4)):
         direction = rng.standard_normal(3) * [1, 1, 0.5]
-        holes.append(Cylinder(direction, _along(direction), rng.uniform(0.1, 0.4), 1.5))
+        holes.append(Cylinder(direction, along(direction), rng.uniform(0.1, 0.4), 1.5))
     return Solid([body], holes)
 
 
@@ -292,23 +304,23 @@ def _wheel(rng: np.random.Generator) -> Solid:
     radius, half, wall = rng.uniform(0.9, 1.6), rng.uniform(0.1, 0.5), _wall(rng)
     hub, bore = rng.uniform(0.2, 0.45), rng.uniform(0.1, 0.15)
     inside = radius - wall
-    parts: list[_Primitive] = [
-        Ring(_off(rng), _axes(rng, 2), radius, half, inside),
-        Ring(_off(rng), _axes(rng, 2), hub, half * rng.uniform(1.05, 1.6), bore),
+    parts: list[Primitive] = [
+        Ring(_off(rng), pose(rng, 2), radius, half, inside),
+        Ring(_off(rng), pose(rng, 2), hub, half * rng.uniform(1.05, 1.6), bore),
     ]
-    holes: list[_Primitive] = []
+    holes: list[Primitive] = []
     if rng.random() < 0.5:
         thick, reach = min(_wall(rng), 0.6 * half), rng.uniform(0.08, 0.3)
         for side in (-1, 1):
             end = np.array([0, 0, side * (half - 0.6 * thick)])
-            parts.append(Ring(end + _off(rng), _axes(rng, 2), radius + reach, thick / 2, inside + 0.3 * wall))
+            parts.append(Ring(end + _off(rng), pose(rng, 2), radius + reach, thick / 2, inside + 0.3 * wall))
     elif rng.random() < 0.5:
         teeth = int(rng.integers(12, 36))
         size = np.array([rng.uniform(0.05, 0.15) + wall / 2, 0.5 * np.pi * radius / teeth, 0.97 * half])
         parts += [Box(radius * turn[:, 0], turn, size) for turn in _around(rng, teeth)]
     middle, long = (hub + inside) / 2, (inside - hub) / 2
     if rng.random() < 0.5:
-        parts.append(Ring(_off(rng), _axes(rng, 2), inside + wall / 2, _wall(rng) / 2, (hub + bore) / 2))
+        parts.append(Ring(_off(rng), pose(rng, 2), inside + wall / 2, _wall(rng) / 2, (hub + bore) / 2))
         hole = rng.uniform(0.3, 0.9) * long
         turns = _around(rng, int(rng.integers(0, 8)))
         holes = [Cylinder(middle * turn[:, 0], np.eye(3), hole, 0.9 * half) for turn in turns]
@@ -331,10 +343,10 @@ def _around(rng: np.random.Generator, count: int) -> list[Floats]:
 def _rods(rng: np.random.Generator) -> Solid:
     """A frame of thin rods between random nodes, with a plate."""
     nodes = rng.uniform(-1.1, 1.1, (rng.integers(4, 8), 3))
-    parts: list[_Primitive] = []
+    parts: list[Primitive] = []
     for first, second in zip(nodes, np.roll(nodes, 1, axis=0), strict=True):
         way = second - first
-        parts.append(Cylinder((first + second) / 2, _along(way), _wall(rng), float(np.linalg.norm(way)) / 2 + 0.05))
+        parts.append(Cylinder((first + second) / 2, along(way), _wall(rng), float(np.linalg.norm(way)) / 2 + 0.05))
     half = rng.uniform(0.5, 1.1, 3)
     half[2] = _wall(rng) / 2
     parts.append(Box(rng.uniform(-0.3, 0.3, 3), Rotation.random(random_state=rng).as_matrix(), half))
@@ -343,7 +355,7 @@ def _rods(rng: np.random.Generator) -> Solid:
 
 def _blob(rng: np.random.Generator) -> Solid:
     """Ellipsoids grown together, some of them flat or thin: bodies with ears, fins and limbs."""
-    parts: list[_Primitive] = [Ellipsoid(half=rng.uniform(0.4, 0.9, 3))]
+    parts: list[Primitive] = [Ellipsoid(half=rng.uniform(0.4, 0.9, 3))]
     for _ in range(rng.integers(4, 9)):
         half = rng.uniform(0.3, 0.8, 3)
         half[2] = rng.choice([_wall(rng), half[2]])

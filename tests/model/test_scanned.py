@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from straightpcf.model.train import scanned
 from straightpcf.model.train.data import ALONG_BEAMS, NOISE_STD, PatchSource, drawn_noise
 from straightpcf.model.train.device_data import DevicePatchSource
 from straightpcf.model.train.record import write_passed
-from straightpcf.model.train.scanned import Scanner, write_scanned
+from straightpcf.model.train.scanned import SCANNED_PLACES, SCANNED_SOLIDS, Scanned, Scanner, write_scanned
 from straightpcf.model.train.solids import Box, Ellipsoid, Solid
 
 EYE = np.array([0.3, -0.2, 4.0])
@@ -70,15 +71,14 @@ def test_rows_may_be_farther_apart_than_points_and_begin_anywhere() -> None:
     assert counts[1] > 2000
 
 
-def test_an_archive_of_scans_is_training_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("what", [SCANNED_SOLIDS, SCANNED_PLACES])
+def test_an_archive_of_scans_is_training_data(what: Scanned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scanned, "COUNTS", (1500, 3000))
-    monkeypatch.setattr(scanned, "_DENSE", 50_000)
-    monkeypatch.setattr(scanned, "_SURFACE", 5000)
     path = tmp_path / "scans.npz"
-    write_scanned(path, 2)
+    write_scanned(path, 2, what=replace(what, dense=50_000, surface=5000))
     with np.load(path) as archive:
-        eyes = [archive[f"scanned{n:03d}/eye"] for n in (0, 1)]
-    assert all(np.linalg.norm(eye) > 2.4 for eye in eyes)
+        eyes = [archive[f"{what.name}{n:03d}/eye"] for n in (0, 1)]
+    assert all(np.linalg.norm(eye) > 0.99 * what.distance[0] for eye in eyes)
     source = PatchSource.read(path)
     assert len(source.clouds) == 4
     for cloud, eye, surface in zip(source.clouds, source.eyes, source.surfaces, strict=True):
@@ -90,7 +90,7 @@ def test_an_archive_of_scans_is_training_data(tmp_path: Path, monkeypatch: pytes
     network = StraightPCF(width=128, distance_width=128).eval()
     write_passed(tmp_path / "passed.npz", Filter(network, threads=2, coverage=2), [path], 1)
     with np.load(tmp_path / "passed.npz") as recorded:
-        assert any(name.startswith("scans/scanned") for name in recorded.files)
+        assert any(name.startswith(f"scans/{what.name}") for name in recorded.files)
 
 
 def test_noise_along_beams_is_along_them_and_of_the_usual_size() -> None:
