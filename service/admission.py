@@ -11,6 +11,7 @@ from straightpcf.service.jobs.record import Load
 
 __all__ = ["Limits"]
 
+_CONVERTED_BYTES_PER_POINT = 100  # the most of real scans: 93, an aerial LAS of 34 a point as text
 _AUTO_PASSES = 5  # the most that `auto` makes with the shipped weights
 
 
@@ -53,10 +54,16 @@ class Limits:
                 f"{load.jobs} jobs of this key are waiting or running; it may have {self.max_jobs_per_key}"
             )
 
-    def spool_bytes(self, size: int, *, weight: int = 0, iterations: int | Literal["auto"] = "auto") -> int:
-        """Say what a job's files may come to: `size` bytes of input, a result as large, patches of `weight` points."""
-        passes = _AUTO_PASSES if iterations == "auto" else iterations
-        return 2 * size + min(weight, self.max_points) * passes * BYTES_PER_POINT
+    def spool_bytes(
+        self, size: int, *, weight: int = 0, iterations: int | Literal["auto"] = "auto", converted: bool = False
+    ) -> int:
+        """Say what a job's files may come to: `size` bytes of input, a result as large, patches of `weight` points.
+
+        converted: whether the result's format is another, of which a point may take more.
+        """
+        passes, points = _AUTO_PASSES if iterations == "auto" else iterations, min(weight, self.max_points)
+        result = max(size, points * _CONVERTED_BYTES_PER_POINT) if converted else size
+        return size + result + points * passes * BYTES_PER_POINT
 
     def check_disk(self, load: Load, free_bytes: int, *, spool: int, written: int = 0) -> None:
         """Raise SpoolFull if a job of `spool` bytes does not fit beside those that are kept and are still to come.

@@ -202,7 +202,9 @@ class Engine:
             options=request.options,
             bytes=size,
             weight=weight,
-            spool=self.limits.spool_bytes(size, weight=weight, iterations=request.options.iterations),
+            spool=self.limits.spool_bytes(
+                size, weight=weight, iterations=request.options.iterations, converted=request.format is not None
+            ),
             digest=hashlib.sha256(json.dumps(said).encode()).hexdigest(),
             idempotency_key=request.idempotency_key,
             traceparent=request.traceparent,

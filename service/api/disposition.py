@@ -9,12 +9,15 @@ from python_multipart.multipart import parse_options_header
 
 __all__ = ["disposition", "disposition_name"]
 
+_PLAIN = re.compile(r"[\w.~-]+", re.ASCII)
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _EXTENDED = re.compile(r";\s*filename\*\s*=\s*(UTF-8|ISO-8859-1)'[\w-]*'([\w!#$&+.^`|~%-]+)", re.ASCII | re.IGNORECASE)
 
 
 def disposition(name: str) -> str:
-    """Return a header that calls a file to be saved by any name, as ASCII."""
+    """Return a header that calls a file to be saved by any name, as ASCII; `curl -OJ` reads the plain form only."""
+    if _PLAIN.fullmatch(name):
+        return f'attachment; filename="{name}"'
     return f"attachment; filename*=utf-8''{quote(name, safe='')}"
 
 

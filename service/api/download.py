@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from straightpcf.points.errors import JobExpired, RangeNotSatisfiable
+from straightpcf.points.errors import JobExpired, PreconditionFailed, RangeNotSatisfiable
 from straightpcf.service.api.disposition import disposition
 from straightpcf.service.api.errors import problem_response
 from straightpcf.service.engine import Engine
@@ -46,11 +46,16 @@ def result_response(
     """Send a job's result, or the part of it that a GET asks for, and close it; `after` runs when it is sent."""
     assert record.result is not None
     headers, size = {**result_headers(record), "Accept-Ranges": "bytes"}, record.result.bytes
+    headers["Content-Disposition"] = disposition(record.result.filename)
     parts: list[str] = []
     if request.method in _CONDITIONAL:
-        if _matches(request.headers.get("if-none-match"), headers["ETag"]):
+        if not _names(request.headers.get("if-match", "*"), headers["ETag"], weakly=False):
             file.close()
-            return Response(status_code=304, headers={"ETag": headers["ETag"]}, background=after)
+            raise PreconditionFailed(f"the result is {headers['ETag']}, which If-Match does not name")
+        if _names(request.headers.get("if-none-match", ""), headers["ETag"], weakly=True):
+            file.close()
+            same = {name: headers[name] for name in ("ETag", "Cache-Control")}  # RFC 9110, 15.4.5
+            return Response(status_code=304, headers=same, background=after)
         asked = _ranges(request, headers["ETag"]) if request.method == "GET" else []  # RFC 9110, 14.2
         parts = [f"{first}-{last}" for first, last in asked if (int(first) < size if first else int(last) > 0)]
         if asked and not parts:
@@ -58,9 +63,7 @@ def result_response(
             error = RangeNotSatisfiable(f"{request.headers['range'][:60]!r} is outside the {size} bytes of the result")
             return problem_response(request, error, 416, headers={"Content-Range": f"bytes */{size}"})
     _leave_ranges(request, parts)
-    return _OpenFileResponse(
-        file, filename=record.result.filename, media_type=record.result.media_type, headers=headers, background=after
-    )
+    return _OpenFileResponse(file, media_type=record.result.media_type, headers=headers, background=after)
 
 
 class _OpenFileResponse(FileResponse):
@@ -126,11 +129,10 @@ def report_and_file(file: IO[bytes], record: JobRecord, *, after: BackgroundTask
     )
 
 
-def _matches(if_none_match: str | None, etag: str) -> bool:
-    if if_none_match is None:
-        return False
-    tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
-    return "*" in tags or etag in tags
+def _names(header: str, etag: str, *, weakly: bool) -> bool:
+    """Say whether If-Match or If-None-Match names a result; weakly: `W/` does not matter (RFC 9110, 8.8.3.2)."""
+    tags = [tag.strip() for tag in header.split(",")]
+    return "*" in tags or etag in tags or (weakly and f"W/{etag}" in tags)
 
 
 def _ranges(request: Request, etag: str) -> list[tuple[str, str]]:

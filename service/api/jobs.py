@@ -42,6 +42,7 @@ def job_response(record: JobRecord, status: int, headers: dict[str, str] | None 
     return JSONResponse(Job.of(record).plain(), status_code=status, headers=at)
 
 
+@router.post("/jobs/", include_in_schema=False, response_class=Response)  # curl takes a redirect for an answer
 @router.post(
     "/jobs", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job",
     openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
@@ -131,7 +132,7 @@ async def delete_job(id: str, request: Request, owner: Owner) -> None:
 
 
 async def _result(id: str, request: Request, owner: Owner) -> Response:
-    """Send the result; `Range`, `If-Range` and `If-None-Match` are understood."""
+    """Send the result; `Range`, `If-Range`, `If-Match` and `If-None-Match` are understood."""
     engine: Engine = request.app.state.engine
     file, record = await open_result(engine, id, owner=owner)
     return result_response(request, file, record)

@@ -120,6 +120,7 @@ EVENTS_PARAMETERS = [_header("Last-Event-ID", "Go on behind this event.", "17")]
 RESULT_PARAMETERS = [
     _header("Range", "Send these bytes alone; what is malformed is ignored.", "bytes=0-65535"),
     _header("If-Range", "Heed Range only while this is the result's ETag.", f'"{_SHA256}"'),
+    _header("If-Match", "Answer 412 unless one of these is the result's ETag.", f'"{_SHA256}"'),
     _header("If-None-Match", "Answer 304 where one of these is the result's ETag.", f'"{_SHA256}"'),
 ]
 
@@ -197,6 +198,7 @@ _PROBLEMS = {
     408: "The body stopped coming (`request_timeout`).",
     409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
     410: "Its files have been removed (`job_expired`).",
+    412: "If-Match names another result (`precondition_failed`).",
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
     415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
     416: "No byte of the result is in the range (`range_not_satisfiable`).",
@@ -255,7 +257,7 @@ RESULT_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"description": "The cloud.", **_FILE},
     206: {"description": "The part that was asked for.", **_FILE},
     304: {"description": "What If-None-Match names is still the result."},
-    **problems(400, 401, 404, 409, 410, 413, 415, 416, 500, 503, 507),
+    **problems(400, 401, 404, 409, 410, 412, 413, 415, 416, 500, 503, 507),
 }
 
 EVENTS_RESPONSES: dict[int | str, dict[str, Any]] = {

@@ -47,8 +47,7 @@ def denoise_file(
     target_format = source_format if job.format is None else format_named(job.format)
     if job.options.normals == "recompute":
         _check_normals(cloud, target_format)
-    if target_format is not source_format:
-        target_format.check(cloud)
+    target_format.check(cloud)
     if on_progress is not None:
         on_progress(0.0, 0)
     was_read = time.monotonic()

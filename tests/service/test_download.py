@@ -66,10 +66,31 @@ def test_parts_out_of_reach_are_left_out_beside_parts_within(http: httpx2.Client
     assert both.headers["content-type"].startswith("multipart/byteranges")
 
 
+def test_if_match_sends_no_other_result_than_the_one_that_is_named(http: httpx2.Client, result: str) -> None:
+    whole = http.get(result)
+    etag = whole.headers["etag"]
+    for named in (etag, f'"other", {etag}', "*"):
+        answer = http.get(result, headers={"If-Match": named, "Range": "bytes=3-7"})
+        assert (answer.status_code, answer.content) == (206, whole.content[3:8]), named
+    for named in ('"other"', f"W/{etag}"):  # strongly compared: RFC 9110, 13.1.1
+        answer = http.get(result, headers={"If-Match": named, "Range": "bytes=3-7"})
+        assert (answer.status_code, answer.json()["code"]) == (412, "precondition_failed"), named
+        assert http.head(result, headers={"If-Match": named}).status_code == 412
+
+
+def test_an_answer_without_a_body_says_how_to_cache(http: httpx2.Client, result: str) -> None:
+    whole = http.get(result)
+    for named in (whole.headers["etag"], f"W/{whole.headers['etag']}", "*"):
+        same = http.get(result, headers={"If-None-Match": named})
+        assert (same.status_code, same.content) == (304, b""), named
+        assert same.headers["cache-control"] == whole.headers["cache-control"]
+
+
 def test_what_denoise_made_is_sent_whole_whatever_the_conditions(http: httpx2.Client) -> None:
     plain = http.post("/denoise?iterations=1", content=_cloud())
     for headers in (
         {"If-None-Match": "*"},
+        {"If-Match": '"other"'},
         {"If-None-Match": plain.headers["etag"]},
         {"Range": "bytes=0-4"},
         {"Range": "bytes=99999999-"},

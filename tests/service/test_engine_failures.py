@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import sqlite3
 import time
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from straightpcf.points.errors import (
@@ -17,6 +19,7 @@ from straightpcf.points.errors import (
     SpoolFull,
 )
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.wire.patches import BYTES_PER_POINT
 from straightpcf.service.backends.base import WorkerDied
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import runner
@@ -87,6 +90,19 @@ def test_a_full_disk_is_said_before_anything_is_written(tmp_path: Path) -> None:
         await submit(engine, b"0 0 0\n")
 
     play(tmp_path, scenario, max_spool_bytes=100)
+
+
+def test_a_format_that_takes_more_than_the_cloud_came_in_is_foreseen(tmp_path: Path) -> None:
+    np.save(floats := io.BytesIO(), np.zeros((50, 3), dtype=np.float32))
+    once = DenoiseOptions(iterations=1)
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        with pytest.raises(SpoolFull):
+            await submit(engine, floats.getvalue(), name="a.npy", options=once, format="xyz")
+        await submit(engine, floats.getvalue(), name="a.npy", options=once)
+
+    room = 2 * len(floats.getvalue()) + 50 * BYTES_PER_POINT
+    play(tmp_path, scenario, max_bytes=2000, max_points=50, max_spool_bytes=room)
 
 
 def test_a_backend_that_can_never_start_says_why_to_every_job(tmp_path: Path) -> None:

@@ -27,6 +27,12 @@ def test_a_slash_behind_denoise_is_no_other_place(server: RunningServer, method:
     assert np.load(io.BytesIO(answer.content)).shape == XYZ.shape
 
 
+def test_nor_is_a_slash_behind_jobs(server: RunningServer) -> None:
+    made = httpx2.post(f"{server.url}/jobs/?iterations=1&filename=a.npy", content=npy(), timeout=60)
+    assert made.status_code == 202, made.text
+    assert httpx2.delete(f"{server.url}{made.headers['location']}").status_code == 204
+
+
 @pytest.mark.parametrize(
     ("query", "form"),
     [

@@ -273,8 +273,8 @@ def test_the_openapi_document_names_the_headers_that_are_read(server: RunningSer
         ("post", "/jobs", {"Idempotency-Key"}),
         ("put", "/jobs/{id}", {"Idempotency-Key"}),
         ("get", "/jobs/{id}/events", {"Last-Event-ID"}),
-        ("get", "/jobs/{id}/result", {"Range", "If-Range", "If-None-Match"}),
-        ("head", "/jobs/{id}/result", {"Range", "If-Range", "If-None-Match"}),
+        ("get", "/jobs/{id}/result", {"Range", "If-Range", "If-Match", "If-None-Match"}),
+        ("head", "/jobs/{id}/result", {"Range", "If-Range", "If-Match", "If-None-Match"}),
     ):
         named = {each["name"] for each in paths[path][method]["parameters"] if each["in"] == "header"}
         assert named == headers, path

@@ -23,9 +23,10 @@ export function url(path) {
 }
 
 export async function call(path, { method = "GET", headers = {}, signal } = {}) {
+  const sent = { ...authorization(), ...headers };
   let response;
   try {
-    response = await fetch(url(path), { method, headers: { ...authorization(), ...headers }, signal, cache: "no-store" });
+    response = await fetch(url(path), { method, headers: sent, signal, cache: "no-store" });
   } catch (error) {
     if (signal?.aborted) throw error;
     throw unreachable();
@@ -68,7 +69,10 @@ export function pause(milliseconds, signal) {
 }
 
 function authorization() {
-  return apiKey() ? { Authorization: `Bearer ${apiKey()}` } : {};
+  const key = apiKey();
+  if (!key) return {};
+  if (/^[\x20-\x7e]*$/.test(key)) return { Authorization: `Bearer ${key}` };
+  throw new Problem({ code: "unauthorized", detail: "The key holds more than printable ASCII, which no request can carry." });
 }
 
 function unreachable() {
