@@ -17,8 +17,10 @@ import straightpcf
 from straightpcf.clients import job_commands
 from straightpcf.clients.atomic import check_target, replaced_when_complete
 from straightpcf.clients.console import (
+    READER_GONE,
     complain,
     exit_code,
+    forget_stdout,
     interruptible,
     needs,
     print_json,
@@ -59,6 +61,9 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except (typer.Exit, typer.Abort):
             raise
+        except BrokenPipeError as error:
+            forget_stdout()
+            raise typer.Exit(READER_GONE) from error
         except Exception as error:
             if hasattr(error, "show") or ctx.params.get("traceback"):  # a usage error shows itself
                 raise
@@ -72,7 +77,7 @@ app = typer.Typer(
     cls=_Commands,
     help="Clean noisy point clouds: the same points, in the same order, on the surface.",
     epilog="Exit codes: 0 done, 2 usage, 3 refused, 4 device or package missing, 5 busy or unreachable, 70 internal, "
-    "130 interrupted or canceled.",
+    "130 interrupted or canceled, 141 nobody reads stdout.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -81,13 +86,24 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; the console script `straightpcf`."""
+    """Run the command line."""
+    if sys.stdout is not None:  # a name that its encoding does not have is no error
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     with quiet_end():
         app(prog_name="straightpcf")
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        version()
+        raise typer.Exit
+
+
 @app.callback()
 def options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
     traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error comes from.")] = False,
 ) -> None:
     """Take the options that stand before the command."""
@@ -129,8 +145,7 @@ def denoise(
             check_suffix(target, format)
     elif target != STDIO:
         format = format_wanted(target.name, name)
-    if url is not None and (device != Device.auto or weights is not None or threads is not None):
-        raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
+    _check_where(url, device, weights, threads)
     with interruptible(), input_file(source, name) as path, output_file(target, suffix) as out:
         if url is not None:
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
@@ -157,6 +172,7 @@ def watch(
     strength: Strength = 1.0,
     normals: Normals = "keep",
     device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
+    weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default one for each CPU.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
     api_key: Key = None,
@@ -166,6 +182,7 @@ def watch(
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
+    _check_where(url, device, weights, threads)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder")
     target = folder / "clean" if target is None else target
@@ -173,12 +190,11 @@ def watch(
     if target.resolve() == folder.resolve():
         raise errors.InvalidOptions(f"--to is {target}, the folder that is watched; results would be taken for input")
     failures = 0
-    with interruptible(), _one_by_one(url, api_key, device, threads, wanted) as run:
+    with interruptible(), _one_by_one(url, api_key, device, weights, threads, wanted) as run:
         for path, outcome in watch_folder(folder, target, run, once=once):
             if isinstance(outcome, Exception):
                 failures += 1
-                typer.echo(f"{path}: ", err=True, nl=False)
-                complain(outcome)
+                complain(outcome, of=path)
             else:
                 show_noise(target / path.name, outcome)
     if failures:
@@ -317,6 +333,11 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 job_commands.install(app)
 
 
+def _check_where(url: str | None, device: Device, weights: Path | None, threads: int | None) -> None:
+    if url is not None and (device != Device.auto or weights is not None or threads is not None):
+        raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
+
+
 def _in_process(device: Device, weights: Path | None, threads: int | None) -> Callable[..., Any]:
     """Load the filter and return what denoises one file with it."""
     with needs("model"):
@@ -339,11 +360,11 @@ def _in_process(device: Device, weights: Path | None, threads: int | None) -> Ca
 
 @contextmanager
 def _one_by_one(
-    url: str | None, api_key: str | None, device: Device, threads: int | None, wanted: Any
+    url: str | None, api_key: str | None, device: Device, weights: Path | None, threads: int | None, wanted: Any
 ) -> Iterator[Callable[[Path, Path], Any]]:
     """Lend what denoises one file into another and returns the report."""
     if url is None:
-        run = _in_process(device, None, threads)
+        run = _in_process(device, weights, threads)
         yield lambda source, target: run(source, target, source.name, None, wanted)
         return
     asked = asdict(wanted)

@@ -1,7 +1,8 @@
 """What the command line shows and how it ends: progress on stderr, tables and JSON on stdout, one line for an error.
 
 Exit codes: 0 done, 2 usage (a port that is taken, too), 3 refused (bad input, no such job), 4 a device or a package is
-missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted (by SIGTERM or SIGHUP, too) or canceled.
+missing, 5 busy, unreachable or not finished, 70 our fault, 130 interrupted (by SIGTERM or SIGHUP, too) or canceled,
+141 who read stdout is gone.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
 
@@ -21,8 +22,11 @@ from straightpcf.points import errors
 
 __all__ = [
     "EXIT_CODES",
+    "READER_GONE",
     "complain",
     "exit_code",
+    "for_each",
+    "forget_stdout",
     "interruptible",
     "needs",
     "print_json",
@@ -34,6 +38,9 @@ __all__ = [
 
 INTERRUPTED = 130
 TIDY_SECONDS = 1.0
+READER_GONE = 141  # as of a process that SIGPIPE ends
+_T = TypeVar("_T")
+_OF_ALL = (errors.InvalidOptions, errors.Unauthorized, errors.ServerBusy, errors.ConnectionFailed)
 
 # The first class that matches counts: the narrow ones come before those that hold them.
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
@@ -58,15 +65,44 @@ def exit_code(error: Exception) -> int:
     return next(code for kind, code in EXIT_CODES if isinstance(error, kind))
 
 
-def complain(error: Exception) -> None:
-    """Say on stderr, in one line, what is wrong."""
+def for_each(items: Sequence[_T], act: Callable[[_T], object]) -> None:
+    """Do the same with each; of several, one that fails is said with its name, and costs the others nothing.
+
+    Exits with the code of the first failure. What would happen to all others, too, ends it at once.
+    """
+    code = 0
+    for number, item in enumerate(items, 1):
+        try:
+            act(item)
+        except (errors.StraightPCFError, OSError) as error:
+            if len(items) == 1 or isinstance(error, BrokenPipeError):
+                raise
+            complain(error, of=item)
+            code = code or exit_code(error)
+            if isinstance(error, _OF_ALL):
+                typer.echo(f"the {len(items) - number} after it were not tried", err=True)
+                break
+    if code:
+        raise typer.Exit(code)
+
+
+def complain(error: Exception, *, of: object = None) -> None:
+    """Say on stderr, in one line, what is wrong; of: with which of several files or jobs."""
     if isinstance(error, errors.StraightPCFError):
         code, text = error.code, error.message
     elif isinstance(error, OSError):
         code, text = errors.InvalidRequest.code, str(error)
     else:
         code, text = errors.InternalError.code, f"{type(error).__name__}: {error} (--traceback shows where)"
-    typer.echo(f"error [{code}]: {' '.join(text.split())}", err=True)
+    where = "" if of is None else f"{of}: "
+    typer.echo(f"{where}error [{code}]: {' '.join(text.split())}", err=True)
+
+
+def forget_stdout() -> None:
+    """Write nothing more to a stdout that nobody reads, so that what is left in its buffer is no error at the end."""
+    import os
+
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from straightpcf.clients.atomic import check_target
-from straightpcf.clients.console import interruptible, print_json, print_table, progress_bar, show_noise
+from straightpcf.clients.console import for_each, interruptible, print_json, print_table, progress_bar, show_noise
 from straightpcf.clients.stdio import STDIO, stdin, stdout
 from straightpcf.points.errors import InvalidOptions
 
@@ -42,8 +42,6 @@ def install(app: typer.Typer) -> None:
 @contextmanager
 def connect(url: str, api_key: str | None) -> Iterator[Client]:
     """Open a client."""
-    if not url.startswith(("http://", "https://", "grpc://", "grpcs://")):
-        raise InvalidOptions(f"--url is {url[:80]!r}; it must begin with http://, https://, grpc:// or grpcs://")
     from straightpcf.clients.sdk import Client
 
     with interruptible(), Client(url, api_key=api_key) as client:
@@ -69,13 +67,16 @@ def submit(
     if name is not None and len(sources) > 1:
         raise InvalidOptions(f"--name is of one file, and there are {len(sources)}")
     with connect(url, api_key) as client:
-        for source in sources:
+
+        def hand_over(source: Path) -> None:
             content: Any = stdin().read() if source == STDIO else source
             job = client.jobs.create(
                 content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
                 format=format, name=name, id=id,
             )  # fmt: skip
             print_json(job.info.json) if as_json else typer.echo(job.id)
+
+        for_each(sources, hand_over)
 
 
 def status(id: Id, url: Url = DEFAULT_URL, api_key: Key = None, as_json: AsJson = False) -> None:
@@ -106,8 +107,7 @@ def cancel(
 ) -> None:
     """End jobs that wait or run."""
     with connect(url, api_key) as client:
-        for id in ids:
-            typer.echo(f"{id} {client.jobs.get(id).cancel().state}")
+        for_each(ids, lambda id: typer.echo(f"{id} {client.jobs.get(id).cancel().state}"))
 
 
 def jobs(

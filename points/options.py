@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Literal, TypeVar
@@ -39,11 +38,11 @@ class DenoiseOptions:
             passes = _whole("iterations", self.iterations, range(1, MAX_ITERATIONS + 1), _ITERATIONS)
             object.__setattr__(self, "iterations", passes)
         object.__setattr__(self, "seed", _whole("seed", self.seed, range(2**32), _SEED))
-        if not (isinstance(self.strength, Real) and math.isfinite(self.strength) and 0 <= self.strength <= 1):
-            raise InvalidOptions(f"strength is {self.strength!r}; it must be {_STRENGTH}")
+        if isinstance(self.strength, bool) or not (isinstance(self.strength, Real) and 0 <= self.strength <= 1):
+            raise InvalidOptions(f"strength is {_shown(self.strength)}; it must be {_STRENGTH}")
         object.__setattr__(self, "strength", float(self.strength))
         if self.normals not in ("keep", "recompute"):
-            raise InvalidOptions(f'normals is {self.normals!r}; it must be "keep" or "recompute"')
+            raise InvalidOptions(f'normals is {_shown(self.normals)}; it must be "keep" or "recompute"')
 
     @classmethod
     def parse(
@@ -66,8 +65,15 @@ class DenoiseOptions:
 
 def _whole(name: str, value: object, allowed: range, limit: str) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral) or int(value) not in allowed:
-        raise InvalidOptions(f"{name} is {value!r}; it must be {limit}")
+        raise InvalidOptions(f"{name} is {_shown(value)}; it must be {limit}")
     return int(value)
+
+
+def _shown(value: object) -> str:
+    try:
+        return repr(value)[:80]
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return f"a {type(value).__name__} of too many digits"
 
 
 def _iterations(text: str) -> int | Literal["auto"]:

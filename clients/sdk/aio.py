@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncGenerator, Collection
+from contextlib import aclosing
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,7 +25,10 @@ __all__ = ["AsyncClient", "AsyncJob", "AsyncJobs"]
 
 
 class AsyncClient:
-    """Call a server from a coroutine; see `Client`. Cancelling a coroutine cancels its work on the server."""
+    """Call a server from a coroutine; see `Client`. Cancelling a coroutine cancels its work on the server.
+
+    A client belongs to the event loop of its first call.
+    """
 
     def __init__(
         self,
@@ -110,7 +114,7 @@ class AsyncJobs:
         """Do as `Jobs.get`."""
         return AsyncJob(self._transport, await self._transport.run(flows.get(id)))
 
-    async def list(self, *, states: Collection[JobState] = (), page_size: int = 50) -> AsyncIterator[AsyncJob]:
+    async def list(self, *, states: Collection[JobState] = (), page_size: int = 50) -> AsyncGenerator[AsyncJob]:
         """Do as `Jobs.list`."""
         cursor: str | None = None
         while True:
@@ -147,19 +151,21 @@ class AsyncJob:
         self.info = await self._transport.run(flow)
         return self.info
 
-    async def events(self, *, after: int = 0) -> AsyncIterator[Event]:
+    async def events(self, *, after: int = 0) -> AsyncGenerator[Event]:
         """Do as `Job.events`."""
         receiver = Events(after=after)
-        async for _ in self._transport.stream((events_call(self.id), receiver)):
-            for event in receiver.take():
-                yield event
+        async with aclosing(self._transport.stream((events_call(self.id), receiver))) as coming:
+            async for _ in coming:
+                for event in receiver.take():
+                    yield event
 
-    async def patches(self) -> AsyncIterator[PatchFrame]:
+    async def patches(self) -> AsyncGenerator[PatchFrame]:
         """Do as `Job.patches`."""
         receiver = Patches()
-        async for _ in self._transport.stream((patches_call(self.id), receiver)):
-            for frame in receiver.take():
-                yield frame
+        async with aclosing(self._transport.stream((patches_call(self.id), receiver))) as coming:
+            async for _ in coming:
+                for frame in receiver.take():
+                    yield frame
 
     async def result(self, target: str | Path | None = None) -> Denoised:
         """Do as `Job.result`."""

@@ -28,7 +28,8 @@ class Client:
     """Call a server from ordinary code; use it as a context manager or close it.
 
     url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
-    api_key: sent as a bearer token.
+    api_key: sent as a bearer token. HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR are
+    heeded over HTTP.
     timeout: seconds of silence that are borne, None for any; of streams (events, patches, progress) at least 60.
     max_retries: of a busy server and of a broken connection; every other error is raised at once. A server that has
     answered and is gone (it is restarted) is asked on for `timeout` seconds, but by what uploads a file; 0: never.

@@ -5,9 +5,10 @@ A flow yields a request with what takes its answer, and is sent the value of tha
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Collection, Generator
-from contextlib import suppress
+from collections.abc import Callable, Collection, Generator, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -19,7 +20,7 @@ from straightpcf.clients.sdk.receive import Body, Events, Receiver
 from straightpcf.clients.sdk.request import Call, Source
 from straightpcf.clients.sdk.response import Health, ServerInfo, parse_health, parse_info
 from straightpcf.clients.sdk.result import Denoised
-from straightpcf.points.errors import JobNotFinished, StraightPCFError
+from straightpcf.points.errors import ConnectionFailed, JobNotFinished, StraightPCFError
 
 __all__ = [
     "Flow",
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 POLL_SECONDS = 20.0  # at most: a server is asked this long for a job's end before it is asked again
+_LATE_SECONDS = 2.0  # after a deadline, for an answer that says how the job stands
 FAREWELL_SECONDS = 5.0  # to give up a job that nobody waits for any more
 
 _T = TypeVar("_T")
@@ -84,26 +86,50 @@ def delete(id: str) -> Flow[None]:
 
 
 def wait(
-    id: str, timeout: float | None, on_progress: OnProgress | None, *, silence: float | None = None
+    id: str,
+    timeout: float | None,
+    on_progress: OnProgress | None,
+    *,
+    silence: float | None = None,
+    deadline: float | None = None,
 ) -> Flow[JobInfo]:
-    """Return the job when it is finished; raises JobNotFinished after timeout seconds.
+    """Return the job when it is finished; raises JobNotFinished after timeout seconds, also of a server that hangs.
 
-    silence: seconds that the client bears, None for any; a healthy server answers within half of them.
+    silence: seconds that the client bears, None for any; a healthy server answers within half of them. deadline: when
+    the timeout is over, where it began before; on the monotonic clock.
     """
     if on_progress is not None and timeout is None:
         return (yield request.events_call(id), _Watched(on_progress))  # type: ignore[no-any-return]
     poll = POLL_SECONDS if silence is None else min(POLL_SECONDS, silence / 2)
-    deadline = None if timeout is None else time.monotonic() + timeout
+    deadline = deadline or _after(timeout)
     while True:
-        left = poll if deadline is None else max(0.0, min(poll, deadline - time.monotonic()))
+        left = max(0.0, min(poll, deadline - time.monotonic()))
         seconds = left if on_progress is None else min(left, 0.5)
-        job: JobInfo = yield request.job_call(id, wait=seconds), Body(JobInfo.parse)
+        with _timely(id, timeout, deadline):
+            job: JobInfo = yield (
+                request.job_call(id, wait=seconds, until=deadline + _LATE_SECONDS), Body(JobInfo.parse)
+            )  # fmt: skip
         if on_progress is not None:
             on_progress(job.progress)
         if job.finished:
             return job
-        if deadline is not None and time.monotonic() >= deadline:
+        if time.monotonic() >= deadline:
             raise JobNotFinished(f"job {id} is {job.state} after {timeout:g} s, {100 * job.progress:.0f} % done")
+
+
+def _after(timeout: float | None) -> float:
+    return math.inf if timeout is None else time.monotonic() + timeout
+
+
+@contextmanager
+def _timely(id: str, timeout: float | None, deadline: float) -> Iterator[None]:
+    """Take a server that is not to be had when the time is over for a job that is not finished."""
+    try:
+        yield
+    except ConnectionFailed as error:
+        if time.monotonic() < deadline:
+            raise
+        raise JobNotFinished(f"job {id} is not known to be finished after {timeout:g} s: {error.message}") from error
 
 
 def fetch(job: JobInfo, target: Path | None, *, source: Source = None, request_id: str = "") -> Flow[Denoised]:
@@ -140,11 +166,13 @@ def denoise(
     **wanted: Any,
 ) -> Flow[Denoised]:
     """Make a job, wait for it, fetch its result and remove it; whatever ends this early ends the job too."""
-    call = request.upload_call(source, target, **wanted)
+    deadline = _after(timeout)
+    call = request.upload_call(source, target, until=deadline + _LATE_SECONDS, **wanted)
     id = call.path.rpartition("/")[2]
     try:
-        yield call, Body(JobInfo.parse)
-        job = yield from wait(id, timeout, on_progress, silence=silence)
+        with _timely(id, timeout, deadline):
+            yield call, Body(JobInfo.parse)
+        job = yield from wait(id, timeout, on_progress, silence=silence, deadline=deadline)
         cloud = source if type(source).__module__.startswith("open3d") else None
         return (yield from fetch(job, target, source=cloud, request_id=call.request_id))
     finally:

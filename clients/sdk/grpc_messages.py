@@ -6,7 +6,7 @@ import base64
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import chain
 from typing import Any
 
 import grpc
@@ -17,14 +17,14 @@ from grpc_health.v1.health_pb2 import HealthCheckRequest, HealthCheckResponse
 from grpc_status import rpc_status
 
 from straightpcf.clients.sdk.receive import Receiver
-from straightpcf.clients.sdk.request import CHUNK_BYTES, Call
+from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure
-from straightpcf.points.errors import ERRORS_BY_CODE, ConnectionFailed, InternalError, TooManyBytes
+from straightpcf.points.errors import ERRORS_BY_CODE, ConnectionFailed, InternalError, StraightPCFError, TooManyBytes
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire.messages import event_of, frame_of, message_of, plain_of
 from straightpcf.points.wire.patches import encode_end, encode_frame, encode_header
 
-__all__ = ["UPLOAD", "Answer", "failed_rpc", "metadata_of", "request_of", "upload_messages"]
+__all__ = ["UPLOAD", "Answer", "Upload", "failed_rpc", "metadata_of", "request_of"]
 
 UPLOAD = "CreateJob"
 
@@ -51,17 +51,21 @@ def request_of(call: Call, receiver: Receiver) -> Message:
     return message_of(_REQUESTS[call.rpc], fields)
 
 
-def upload_messages(call: Call) -> Iterator[pb.CreateJobRequest]:
-    """Yield a job's config and its file in chunks."""
-    yield pb.CreateJobRequest(config=message_of(pb.JobConfig, call.fields))
-    if isinstance(call.body, Path):
-        with call.body.open("rb") as file:
-            while chunk := file.read(CHUNK_BYTES):
-                yield pb.CreateJobRequest(chunk=chunk)
-    else:
-        body = call.body or b""
-        for start in range(0, len(body), CHUNK_BYTES):
-            yield pb.CreateJobRequest(chunk=body[start : start + CHUNK_BYTES])
+class Upload(Iterator[pb.CreateJobRequest]):
+    """A job's config and its file in chunks; error: what kept the rest from being read, of which gRPC says nothing."""
+
+    def __init__(self, call: Call) -> None:
+        chunks = (pb.CreateJobRequest(chunk=chunk) for chunk in call.chunks())
+        self._messages = chain([pb.CreateJobRequest(config=message_of(pb.JobConfig, call.fields))], chunks)
+        self.error: Exception | None = None
+
+    def __next__(self) -> pb.CreateJobRequest:
+        """Make one message."""
+        try:
+            return next(self._messages)
+        except (StraightPCFError, OSError) as error:
+            self.error = error
+            raise
 
 
 def metadata_of(call: Call, api_key: str | None) -> tuple[tuple[str, str], ...]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport
-from straightpcf.points.errors import InvalidRequest, MissingDependency
+from straightpcf.points.errors import MissingDependency
 
 try:
     import grpc
@@ -18,10 +19,10 @@ try:
     from straightpcf.clients.sdk.grpc_messages import (
         UPLOAD,
         Answer,
+        Upload,
         failed_rpc,
         metadata_of,
         request_of,
-        upload_messages,
     )
     from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub
 except ImportError as exc:
@@ -48,19 +49,23 @@ class GrpcTransport(Transport):
 
     def close(self) -> None:
         """Close the connections."""
+        self.closed = True
         self._channel.close()
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one call."""
-        send = upload_messages(call) if call.rpc == UPLOAD else request_of(call, receiver)
+        upload = Upload(call) if call.rpc == UPLOAD else None
         try:
             answer = Answer(call, receiver)
+            send = upload or request_of(call, receiver)
             came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
             for message in came if hasattr(came, "__next__") else (came,):
                 answer.take(message)
                 yield
             attempts.failure = answer.finish()
         except grpc.RpcError as error:
+            if upload is not None and upload.error is not None:
+                raise upload.error from None
             attempts.failure = failed_rpc(error, self._url)
 
 
@@ -72,19 +77,20 @@ class AsyncGrpcTransport(AsyncTransport):
         self._url, self._key = url, api_key
         self._channel: Any = None  # it belongs to the loop that makes the first call
         self._stub: Any = None
-        _target(url)
 
     async def close(self) -> None:
         """Close the connections."""
+        self.closed = True
         if self._channel is not None:
             await self._channel.close()
 
-    async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
+    async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncGenerator[None]:
         """Make one call."""
         self._open()
-        send = _asynchronous(upload_messages(call)) if call.rpc == UPLOAD else request_of(call, receiver)
+        upload = Upload(call) if call.rpc == UPLOAD else None
         try:
             answer = Answer(call, receiver)
+            send = request_of(call, receiver) if upload is None else _asynchronous(upload)
             came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
             if hasattr(came, "__aiter__"):
                 async for message in came:
@@ -94,7 +100,11 @@ class AsyncGrpcTransport(AsyncTransport):
                 answer.take(await came)
                 yield
             attempts.failure = answer.finish()
-        except grpc.RpcError as error:
+        except (grpc.RpcError, asyncio.CancelledError) as error:
+            if upload is not None and upload.error is not None:
+                raise upload.error from None
+            if not isinstance(error, grpc.RpcError):
+                raise
             attempts.failure = failed_rpc(error, self._url)
 
     def _open(self) -> None:
@@ -115,22 +125,15 @@ def _stub(channel: Any) -> Any:
 
 def _target(url: str) -> tuple[str, Any]:
     parts = urlsplit(url)
-    if not parts.hostname or parts.path.strip("/"):
-        raise InvalidRequest(
-            f"{url!r} is no address of a gRPC server; it must be grpc://HOST:PORT or grpcs://HOST:PORT"
-        )
     return parts.netloc, grpc.ssl_channel_credentials() if parts.scheme == "grpcs" else None
 
 
 def _how(call: Call, api_key: str | None, timeout: float | None) -> dict[str, Any]:
     """Return the metadata and, for a call with one short answer, the deadline."""
-    silence = timeout if call.timeout is None else call.timeout
     short = call.rpc in ("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth")
-    return {"metadata": metadata_of(call, api_key), "timeout": silence if short else None}
+    return {"metadata": metadata_of(call, api_key), "timeout": call.patience(timeout) if short else None}
 
 
 async def _asynchronous(messages: Iterator[Any]) -> AsyncIterator[Any]:
-    import asyncio
-
     while (message := await asyncio.to_thread(next, messages, None)) is not None:
         yield message

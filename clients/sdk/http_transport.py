@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
-from typing import Any
+import math
+from collections.abc import AsyncGenerator, Iterator
+from typing import Any, TypeVar
 
 import httpx2
 
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.response import failed_connection, failed_response
-from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport, without_password
+from straightpcf.points.errors import InvalidOptions, MissingDependency
 
 __all__ = ["CONNECT_TIMEOUT_SECONDS", "AsyncHttpTransport", "HttpTransport"]
 
 CONNECT_TIMEOUT_SECONDS = 10.0
+_Client = TypeVar("_Client", httpx2.Client, httpx2.AsyncClient)
 _FAULTS = (httpx2.TransportError, httpx2.SSEError)
 
 
@@ -23,18 +25,19 @@ class HttpTransport(Transport):
     """Talk to the REST API."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.timeout, self.max_retries = timeout, max_retries
-        self._http = httpx2.Client(**_options(url, api_key, timeout))
+        self.timeout, self.max_retries, self._url = timeout, max_retries, without_password(url)
+        self._http = _made(httpx2.Client, url, api_key, timeout)
 
     def close(self) -> None:
         """Close the connections."""
+        self.closed = True
         self._http.close()
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one request."""
         asked = _request(call, receiver, self.timeout)
         try:
-            with call.open_body() as body, self._http.stream(**asked, content=body) as response:
+            with self._http.stream(**asked, content=None if call.body is None else call.chunks()) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
                     has_events = call.events and response.status_code != 204
@@ -46,25 +49,27 @@ class HttpTransport(Transport):
                     response.read()
                     attempts.failure = failed_response(response)
         except _FAULTS as fault:
-            attempts.failure = failed_connection(fault, self._http.base_url)
+            attempts.failure = failed_connection(fault, self._url)
 
 
 class AsyncHttpTransport(AsyncTransport):
     """Talk to the REST API from a coroutine."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
-        self.timeout, self.max_retries = timeout, max_retries
-        self._http = httpx2.AsyncClient(**_options(url, api_key, timeout))
+        self.timeout, self.max_retries, self._url = timeout, max_retries, without_password(url)
+        self._http = _made(httpx2.AsyncClient, url, api_key, timeout)
 
     async def close(self) -> None:
         """Close the connections."""
+        self.closed = True
         await self._http.aclose()
 
-    async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
+    async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncGenerator[None]:
         """Make one request."""
         asked = _request(call, receiver, self.timeout)
         try:
-            async with self._http.stream(**asked, content=call.stream_body()) as response:
+            body = None if call.body is None else call.async_chunks()
+            async with self._http.stream(**asked, content=body) as response:
                 if response.is_success:
                     receiver.begin(response.status_code, response.headers)
                     has_events = call.events and response.status_code != 204
@@ -76,31 +81,33 @@ class AsyncHttpTransport(AsyncTransport):
                     await response.aread()
                     attempts.failure = failed_response(response)
         except _FAULTS as fault:
-            attempts.failure = failed_connection(fault, self._http.base_url)
+            attempts.failure = failed_connection(fault, self._url)
 
 
-def _options(url: str, api_key: str | None, timeout: float | None) -> dict[str, Any]:
+def _made(kind: type[_Client], url: str, api_key: str | None, timeout: float | None) -> _Client:
     try:
         base = httpx2.URL(url)
     except httpx2.InvalidURL as exc:
-        raise InvalidRequest(f"{url[:80]!r} is no address of a server: {exc}") from exc
-    return {
-        "base_url": base,
-        "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
-        "timeout": _silence(timeout),
-    }
+        raise InvalidOptions(f"{without_password(url)[:80]!r} is no address of a server: {exc}") from exc
+    headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+    try:
+        return kind(base_url=base, headers=headers, timeout=_silence(timeout))
+    except ImportError as exc:
+        raise MissingDependency("the environment (ALL_PROXY, ...) names a SOCKS proxy: pip install socksio") from exc
+    except (httpx2.InvalidURL, ValueError, OSError) as exc:
+        named = "HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE, SSL_CERT_DIR"
+        raise InvalidOptions(f"what the environment says of proxies or certificates ({named}): {exc}") from exc
 
 
 def _request(call: Call, receiver: Receiver, timeout: float | None) -> dict[str, Any]:
-    silence = None if timeout is None else _silence(max(timeout, call.silence))
     return {
         "method": call.method,
         "url": call.path,
         "params": call.params,
         "headers": {**call.all_headers(), **receiver.headers()},
-        "timeout": silence if call.timeout is None else call.timeout,
+        "timeout": _silence(call.patience(timeout)),
     }
 
 
 def _silence(seconds: float | None) -> httpx2.Timeout:
-    return httpx2.Timeout(seconds, connect=CONNECT_TIMEOUT_SECONDS)
+    return httpx2.Timeout(seconds, connect=min(CONNECT_TIMEOUT_SECONDS, math.inf if seconds is None else seconds))

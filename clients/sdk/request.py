@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import io
+import math
 import os
+import time
 import uuid
-from collections.abc import AsyncIterator, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import AsyncGenerator, Collection, Generator, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +44,7 @@ __all__ = [
 ]
 
 CHUNK_BYTES = 2**18
+_LEAST_SECONDS = 0.1  # to answer, however late it is
 STREAM_SECONDS = 60.0  # a stream is silent while its job waits; of events something comes every 15
 
 # An open3d cloud is recognised by its `points`, so that open3d need not be here.
@@ -57,7 +60,7 @@ class Call:
     rpc, fields: the same as a call of the gRPC service, in the JSON form of its message.
     request_id: names the request in the server's log, the same for every attempt.
     timeout: seconds of silence to bear, None for the client's own. silence: those to bear at least.
-    events: the answer is a stream of events. once: do not try again.
+    events: the answer is a stream of events. once: do not try again. until: give up then, on the monotonic clock.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -71,24 +74,33 @@ class Call:
     silence: float = 0.0
     events: bool = False
     once: bool = False
+    until: float = math.inf
     request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def all_headers(self) -> dict[str, str]:
         """Return the headers to send."""
         return {"X-Request-Id": self.request_id, **self.headers}
 
-    @contextmanager
-    def open_body(self) -> Iterator[bytes | IO[bytes] | None]:
-        """Open the body for the sync client."""
-        if isinstance(self.body, Path):
-            with self.body.open("rb") as file:
-                yield file
-        else:
-            yield self.body
+    def patience(self, usual: float | None) -> float | None:
+        """Return the seconds of silence to bear from now on; usual: the client's own, None for any."""
+        own = self.timeout
+        if own is None and usual is not None:
+            own = max(usual, self.silence)
+        left = max(_LEAST_SECONDS, self.until - time.monotonic())
+        return own if math.isinf(left) else left if own is None else min(own, left)
 
-    def stream_body(self) -> bytes | AsyncIterator[bytes] | None:
-        """Open the body for the async client, files read off the event loop."""
-        return _read_chunks(self.body) if isinstance(self.body, Path) else self.body
+    def chunks(self) -> Generator[bytes]:
+        """Read the body; raises InvalidRequest where a file is no longer as large as the headers say, OSError."""
+        if isinstance(self.body, Path):
+            yield from _read_chunks(self.body, int(self.headers["Content-Length"]))
+        elif self.body is not None:
+            yield from (self.body[at : at + CHUNK_BYTES] for at in range(0, len(self.body), CHUNK_BYTES))
+
+    async def async_chunks(self) -> AsyncGenerator[bytes]:
+        """Read the body off the event loop; raises as `chunks` does."""
+        with closing(self.chunks()) as chunks:
+            while chunk := await asyncio.to_thread(next, chunks, b""):
+                yield chunk
 
 
 def upload_call(
@@ -103,6 +115,7 @@ def upload_call(
     name: str | Path | None = None,
     key: str | None = None,
     id: str | None = None,
+    until: float = math.inf,
 ) -> Call:
     """Build the request that hands over one cloud, as job `id`.
 
@@ -139,7 +152,10 @@ def upload_call(
         raise InvalidRequest(f"job id is {id[:80]!r}; it must be {JOB_ID_RULE}")
     fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id}
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
-    return Call(method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body)
+    return Call(
+        method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body,
+        until=until,
+    )  # fmt: skip
 
 
 def get_call(path: str, rpc: str) -> Call:
@@ -147,15 +163,16 @@ def get_call(path: str, rpc: str) -> Call:
     return Call(method="GET", path=path, rpc=rpc)
 
 
-def job_call(id: str, *, wait: float = 0.0) -> Call:
+def job_call(id: str, *, wait: float = 0.0, until: float = math.inf) -> Call:
     """Build the request that looks at a job, `wait` seconds long if it is not finished."""
     params = {"wait": f"{wait:g}"} if wait > 0 else {}
-    return Call(method="GET", path=_job(id), rpc="GetJob", fields={"id": id, "wait_seconds": wait}, params=params)
+    fields = {"id": id, "wait_seconds": wait}
+    return Call(method="GET", path=_job(id), rpc="GetJob", fields=fields, params=params, until=until)
 
 
 def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
     """Build the request for one page of jobs; raises InvalidRequest."""
-    states = list(states)  # which may be an iterator
+    states = [states] if isinstance(states, str) else list(states)  # which may be an iterator
     if unknown := set(states) - set(STATES):
         raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
     if not 1 <= limit <= MAX_PAGE_SIZE:
@@ -205,8 +222,10 @@ def delete_call(id: str, *, timeout: float | None = None) -> Call:
 
 
 def _job(id: str, part: str = "") -> str:
-    if not JOB_ID.fullmatch(id):  # it would name another path: "" the list of jobs, ".." the page
-        raise NotFound(f"there is no job {id[:64]!r}; an id is {JOB_ID_RULE}")
+    if not isinstance(id, str) or not JOB_ID.fullmatch(
+        id
+    ):  # it would name another path: "" the list of jobs, ".." the page
+        raise NotFound(f"there is no job {str(id)[:64]!r}; an id is {JOB_ID_RULE}")
     return f"/jobs/{id}" + (f"/{part}" if part else "")
 
 
@@ -231,7 +250,10 @@ def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
         return None, bytes(source)
     if hasattr(source, "read"):
         raise InvalidRequest("a source is a path, bytes, an array or an open3d cloud; of an open file, give its bytes")
-    return "cloud.npy", _npy(np.asarray(getattr(source, "points", source)))
+    try:
+        return "cloud.npy", _npy(np.ma.asanyarray(getattr(source, "points", source)))
+    except ValueError as exc:  # rows of several lengths
+        raise InvalidCloud(f"an array of points must be (N, 3) numbers: {exc}") from exc
 
 
 def _sendable(name: str | Path | None) -> str | None:
@@ -239,17 +261,26 @@ def _sendable(name: str | Path | None) -> str | None:
     return None if name is None else os.fspath(name).encode("utf-8", "replace").decode()
 
 
-def _npy(xyz: npt.NDArray[Any]) -> bytes:
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
-        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {xyz.shape} {xyz.dtype}")
-    if xyz.dtype.kind != "f":
+def _npy(source: npt.NDArray[Any]) -> bytes:
+    if source.ndim != 2 or source.shape[1] != 3 or source.dtype.kind not in "fiu":
+        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {source.shape} {source.dtype}")
+    xyz = np.asarray(source)
+    if xyz.dtype.kind != "f" or xyz.dtype.itemsize > 8:
         xyz = xyz.astype(np.float64)
+    if (hidden := np.ma.getmaskarray(source)).any():  # what is masked is no point, and passes through as such
+        xyz = np.where(hidden, np.nan, xyz)
     buffer = io.BytesIO()
     np.save(buffer, xyz, allow_pickle=False)
     return buffer.getvalue()
 
 
-async def _read_chunks(path: Path) -> AsyncIterator[bytes]:
-    with await asyncio.to_thread(path.open, "rb") as file:
-        while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+def _read_chunks(path: Path, size: int) -> Generator[bytes]:
+    with path.open("rb") as file:
+        left = size
+        while left > 0 and (chunk := file.read(min(CHUNK_BYTES, left))):
+            left -= len(chunk)
+            if left == 0 and file.read(1):
+                break  # before the server has what would look whole
             yield chunk
+        if left > 0 or file.tell() > size:
+            raise InvalidRequest(f"{path} changed while it was read: it had {size} bytes before")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import aclosing
 from typing import TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import urlsplit, urlunsplit
 
 from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
@@ -16,18 +18,20 @@ from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure, next_delay
 from straightpcf.points.errors import ConnectionFailed, InvalidOptions, InvalidRequest
 
-__all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async"]
+__all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async", "without_password"]
 
+_SCHEMES = ("http", "https", "grpc", "grpcs")
 _T = TypeVar("_T")
 
 
 def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> Transport:
     """Choose the transport by the URL's scheme: http(s), or grpc(s) with the extra `grpc`.
 
-    Raises InvalidOptions, InvalidRequest for a key and a URL that cannot be.
+    Raises InvalidOptions for a URL and a key that cannot be, MissingDependency.
     """
-    _check(url, api_key)
-    if _is_grpc(url):
+    url = _address(url)
+    _check(api_key)
+    if url.startswith("grpc"):
         from straightpcf.clients.sdk.grpc_transport import GrpcTransport
 
         return GrpcTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
@@ -38,8 +42,9 @@ def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries
 
 def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> AsyncTransport:
     """Do as `connect`."""
-    _check(url, api_key)
-    if _is_grpc(url):
+    url = _address(url)
+    _check(api_key)
+    if url.startswith("grpc"):
         from straightpcf.clients.sdk.grpc_transport import AsyncGrpcTransport
 
         return AsyncGrpcTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
@@ -48,19 +53,40 @@ def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_r
     return AsyncHttpTransport(url, api_key=api_key, timeout=timeout, max_retries=max_retries)
 
 
-def _check(url: str, api_key: str | None) -> None:
+def without_password(url: str) -> str:
+    """Return a URL as it may be shown and logged."""
+    return re.sub(r"//[^/]*@", "//", url)
+
+
+def _address(url: str) -> str:
+    """Return a server's URL in one spelling: its scheme in small letters, no slash at its end."""
+    shown = without_password(url)[:80]
     try:
-        _ = urlsplit(url).port
+        parts = urlsplit(url)
+        port = parts.port
     except ValueError as exc:
-        raise InvalidRequest(f"{url[:80]!r} is no address of a server: {exc}") from exc
+        raise InvalidOptions(f"{shown!r} is no address of a server: {exc}") from exc
+    wrong = None
+    if parts.scheme not in _SCHEMES:
+        wrong = "it must begin with http://, https://, grpc:// or grpcs://"
+    elif not parts.hostname:
+        wrong = "it names no host"
+    elif parts.query or parts.fragment:
+        wrong = "a query is not part of it"
+    elif parts.scheme == "grpc" and port is None:
+        wrong = "gRPC has no usual port: grpc://HOST:PORT"
+    elif parts.scheme.startswith("grpc") and (parts.path.strip("/") or parts.username is not None):
+        wrong = "it must be grpc://HOST:PORT or grpcs://HOST:PORT"
+    if wrong is not None:
+        raise InvalidOptions(f"{shown!r} is no address of a server: {wrong}")
+    return urlunsplit((parts.scheme, parts.netloc, parts.path.rstrip("/"), "", ""))
+
+
+def _check(api_key: str | None) -> None:
     if api_key is not None and not (api_key.isascii() and api_key.isprintable()):
         raise InvalidOptions("the API key holds more than printable ASCII, which no header can carry")
     if api_key is not None and (not api_key or api_key != api_key.strip()):
         raise InvalidOptions("the API key is empty, or begins or ends with a space")
-
-
-def _is_grpc(url: str) -> bool:
-    return url.startswith(("grpc://", "grpcs://"))
 
 
 class Attempts:
@@ -74,7 +100,7 @@ class Attempts:
         self._max_retries = 0 if call.once else max_retries
         self._patience = patience if call.body is None else 0.0
         self._attempt, self._furthest = 0, receiver.furthest
-        self._since = math.nan
+        self._since, self._until = math.nan, call.until
         self.failure: Failure | None = None
 
     def delay(self) -> float:
@@ -89,7 +115,7 @@ class Attempts:
         if most and is_gone and time.monotonic() - self._since < self._patience:
             most = max(most, self._attempt + 1)
         delay = next_delay(self.failure, attempt=self._attempt, max_retries=most)
-        if delay is None:
+        if delay is None or (self._until < math.inf and time.monotonic() + delay > self._until):
             raise self.failure.error from self.failure.cause
         self._attempt += 1
         return delay
@@ -100,10 +126,13 @@ class _Patience:
 
     timeout: float | None
     max_retries: int
+    closed = False
     _has_answered = False
 
     def attempts(self, step: Step) -> Attempts:
-        """Begin to count the attempts of one request."""
+        """Begin to count the attempts of one request; raises InvalidRequest of a client that is closed."""
+        if self.closed:
+            raise InvalidRequest("this client is closed")
         patience = math.inf if self.timeout is None else self.timeout
         return Attempts(*step, self.max_retries, patience if self._has_answered else 0.0)
 
@@ -153,7 +182,7 @@ class AsyncTransport(_Patience, ABC):
         """Close the connections."""
 
     @abstractmethod
-    def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncIterator[None]:
+    def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncGenerator[None]:
         """Do as `Transport.attempt`."""
 
     async def run(self, flow: Flow[_T]) -> _T:
@@ -171,12 +200,13 @@ class AsyncTransport(_Patience, ABC):
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
 
-    async def stream(self, step: Step) -> AsyncIterator[None]:
+    async def stream(self, step: Step) -> AsyncGenerator[None]:
         """Do as `Transport.stream`."""
         attempts = self.attempts(step)
         while True:
-            async for _ in self.attempt(*step, attempts):
-                yield
+            async with aclosing(self.attempt(*step, attempts)) as coming:
+                async for _ in coming:
+                    yield
             if attempts.failure is None:
                 self._has_answered = True
                 return

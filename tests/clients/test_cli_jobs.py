@@ -71,10 +71,11 @@ def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, t
         (("status", "no-such-job"), 3, "not_found"),
         (("status", ""), 3, "not_found"),  # an unset $ID
         (("result", "no-such-job", "/dev/null"), 3, "/dev/null"),
-        (("jobs", "--url", "http://127.0.0.1:80a0"), 3, "no address"),
+        (("jobs", "--url", "http://127.0.0.1:80a0"), 2, "no address"),
         (("jobs", "--state", "gone"), 2, "invalid_options"),
         (("jobs", "--url", "ftp://x"), 2, "invalid_options"),
         (("denoise", tmp_path / "large.npy", tmp_path / "c.npy", "--url", server.url, "--device", "cpu"), 2, "device"),
+        (("watch", tmp_path, "--once", "--url", server.url, "--threads", "1"), 2, "--threads"),
     ):
         done = cli(server, *arguments)
         assert (done.returncode, done.stderr.count(b"\n")) == (code, 1), done.stderr
@@ -83,6 +84,40 @@ def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, t
     assert cli(server, "wait", id, "--timeout", 0.2).returncode == 5
     assert cli(server, "cancel", id).stdout.decode() == f"{id} canceled\n"
     assert cli(server, "wait", id).returncode == 130
+
+
+def test_of_several_what_fails_is_named_and_costs_the_others_nothing(server: RunningServer, scan: Path) -> None:
+    missing = scan.with_name("missing.npy")
+    done = cli(server, "submit", scan, missing, scan, "--iterations", 1)
+    ids = done.stdout.decode().split()
+    assert (done.returncode, len(ids)) == (3, 2)
+    assert done.stderr.decode().startswith(f"{missing}: error [invalid_request]")
+    done = cli(server, "cancel", "gone", *ids)
+    assert (done.returncode, done.stdout.count(b"\n")) == (3, 2)
+    assert done.stderr.startswith(b"gone: error [not_found]")
+    done = cli(server, "submit", scan, scan, scan, "--iterations", "many")
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 2)
+    assert b"the 2 after it were not tried" in done.stderr
+
+
+def test_a_reader_that_goes_away_and_a_name_that_stdout_cannot_show_are_no_errors(
+    server: RunningServer, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "x.npy", noisy(torus(POINTS), 0.01))
+    id = cli(server, "submit", tmp_path / "x.npy", "--name", "wölkchen 云.npy").stdout.decode().strip()
+    line = f"{{ {sys.executable} -m straightpcf.clients.cli jobs; echo $? >&2; }} | true"
+    environment = clean_environment() | {"STRAIGHTPCF_URL": server.url, "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run(["/bin/sh", "-c", line], stderr=subprocess.PIPE, env=environment, check=False)
+    assert done.stderr.strip() in (b"141", b"0")  # 0: it was done before
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "jobs"]
+    shown = subprocess.run(command, capture_output=True, env=environment, check=True).stdout
+    assert f"{id} ".encode() in shown
+    assert "wölkchen \\u4e91.npy".encode("latin-1") in shown
+
+
+def test_the_console_script_runs_the_same(server: RunningServer) -> None:
+    command = [sys.executable, "-m", "straightpcf.clients", "version"]
+    assert subprocess.run(command, capture_output=True, check=True).stdout == cli(None, "version").stdout
 
 
 def test_denoise_on_a_server_gives_the_bytes_of_this_process(server: RunningServer, scan: Path) -> None:

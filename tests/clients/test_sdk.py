@@ -23,7 +23,7 @@ from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, retry, t
 from straightpcf.clients.sdk.aio import AsyncJobs
 from straightpcf.clients.sdk.client import Jobs
 from straightpcf.clients.sdk.receive import Body
-from straightpcf.clients.sdk.request import Call
+from straightpcf.clients.sdk.request import Call, upload_call
 from straightpcf.clients.sdk.transport import Attempts
 from straightpcf.points.errors import (
     ConnectionFailed,
@@ -31,6 +31,7 @@ from straightpcf.points.errors import (
     InvalidCloud,
     InvalidOptions,
     InvalidRequest,
+    MissingDependency,
     ServerBusy,
     TooFewPoints,
     TooManyBytes,
@@ -290,11 +291,77 @@ def test_an_error_that_would_only_come_again_is_not_retried() -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["http://127.0.0.1:80a0", "http://256.1.1.1", "http://127.0.0.1:99999", "grpc://127.0.0.1:99999", "http://[::1"],
-)
+    [
+        "http://127.0.0.1:80a0", "http://256.1.1.1", "http://127.0.0.1:99999", "grpc://127.0.0.1:99999", "http://[::1",
+        "http://", "ftp://host", "host:8000", "http://host/?x=1", "grpc://host", "grpc://host:1/path", "grpc://u@host:1",
+    ],
+)  # fmt: skip
 def test_a_url_that_cannot_be_is_refused_at_once(url: str) -> None:
-    with pytest.raises(InvalidRequest, match="is no address"):
+    with pytest.raises(InvalidOptions, match="is no address"):
         Client(url)
+    with pytest.raises(InvalidOptions, match="is no address"):
+        AsyncClient(url)
+
+
+def test_a_url_may_have_a_large_scheme_and_slashes_at_its_end() -> None:
+    with answering(HEALTHY) as (url, heads), Client(url.replace("http", "HTTP") + "//") as client:
+        assert client.health().ready
+    assert heads[0].startswith(b"GET /healthz ")
+
+
+def test_a_password_in_a_url_is_never_shown() -> None:
+    for url in ("http://user:secret@127.0.0.1:1", "http://user:secret@127.0.0.1:1?x=1"):
+        with pytest.raises((ConnectionFailed, InvalidOptions), match=r"//127\.0\.0\.1:1") as found:
+            Client(url, max_retries=0).health()
+        assert "secret" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("ALL_PROXY", "socks5://127.0.0.1:1", MissingDependency),
+        ("HTTP_PROXY", "ftp://127.0.0.1:1", InvalidOptions),
+        ("SSL_CERT_FILE", "/nowhere/certificates.pem", InvalidOptions),
+    ],
+)
+def test_an_environment_that_cannot_be_used_is_named(
+    name: str, value: str, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    for make in (Client, AsyncClient):
+        with pytest.raises(kind, match=name):
+            make("http://127.0.0.1:1")
+
+
+def test_arrays_of_every_kind_are_sent_as_numbers_that_a_server_reads() -> None:
+    def sent(source: object) -> np.ndarray:
+        call = upload_call(source, iterations=1, seed=0, strength=1.0, format=None)
+        assert isinstance(call.body, bytes)
+        array: np.ndarray = np.load(io.BytesIO(call.body))
+        return array
+
+    masked = np.ma.masked_array(np.ones((2, 3), dtype=np.float32), mask=[[0, 0, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(sent(masked), np.array([[1, 1, 1], [np.nan, 1, 1]], dtype=np.float32))
+    assert sent(np.ones((2, 3), dtype=np.longdouble)).dtype == np.float64
+    assert sent([[1, 2, 3], [4, 5, 6]]).dtype == np.float64
+    with pytest.raises(InvalidCloud):
+        sent([[1, 2, 3], [4, 5]])
+
+
+def test_a_client_that_is_closed_says_so() -> None:
+    async def ask_closed(url: str) -> None:
+        client = AsyncClient(url)
+        await client.aclose()
+        await client.health()
+
+    for url in ("http://127.0.0.1:1", "grpc://127.0.0.1:1"):
+        client = Client(url)
+        client.close()
+        client.close()
+        with pytest.raises(InvalidRequest, match="closed"):
+            client.health()
+        with pytest.raises(InvalidRequest, match="closed"):
+            asyncio.run(ask_closed(url))
 
 
 @pytest.mark.parametrize("key", ["", " secret", "secret "])

@@ -6,9 +6,11 @@ import asyncio
 import hashlib
 import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import AsyncGenerator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from straightpcf.clients.sdk import AsyncClient, Client, Completed, Output, Preview, Progress, Queued, Started, retry
+from straightpcf.clients.sdk import (
+    AsyncClient,
+    Client,
+    Completed,
+    Job,
+    Output,
+    Preview,
+    Progress,
+    Queued,
+    Started,
+    flows,
+    retry,
+)
+from straightpcf.clients.sdk.job_info import JobInfo
+from straightpcf.clients.sdk.receive import Body, Events
+from straightpcf.clients.sdk.request import events_call, upload_call
+from straightpcf.clients.sdk.transport import AsyncTransport
 from straightpcf.points.errors import (
     ConnectionFailed,
     IdConflict,
@@ -282,6 +300,63 @@ def done(server: RunningServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any
         job.delete()
 
 
+@pytest.mark.parametrize("change", ["grown", "shrunk", "removed"])
+@pytest.mark.parametrize("is_async", [False, True])
+def test_a_file_that_changes_while_it_is_sent_is_named(
+    url: str, tmp_path: Path, change: str, *, is_async: bool
+) -> None:
+    path = tmp_path / "growing.xyz"
+    path.write_text("0 0 0\n" * 100_000)
+
+    def hand_over() -> flows.Flow[JobInfo]:
+        call = upload_call(path, iterations=1, seed=0, strength=1.0, format=None)
+        text = path.read_text()
+        path.unlink()
+        if change != "removed":
+            path.write_text(text + "0 0 0\n" if change == "grown" else text[:-6])
+        return (yield call, Body(JobInfo.parse))  # type: ignore[no-any-return]
+
+    async def run() -> None:
+        async with AsyncClient(url) as client:
+            await client._transport.run(hand_over())
+
+    kind = FileNotFoundError if change == "removed" else InvalidRequest
+    with Client(url) as client:
+        before = [job.id for job in client.jobs.list()]
+        with pytest.raises(kind, match=r"growing\.xyz"):
+            asyncio.run(run()) if is_async else client._transport.run(hand_over())
+        assert [job.id for job in client.jobs.list()] == before
+
+
+class _Endless(AsyncTransport):
+    """A server that goes on and on."""
+
+    timeout, max_retries = None, 0
+    ended = False
+
+    async def close(self) -> None:
+        """Close nothing."""
+
+    async def attempt(self, *_: object) -> AsyncGenerator[None]:
+        """Let something come, again and again."""
+        try:
+            while True:
+                yield
+        finally:
+            self.ended = True
+
+
+def test_closing_what_follows_a_job_ends_its_request_at_once() -> None:
+    async def follow() -> None:
+        transport = _Endless()
+        coming = transport.stream((events_call("a"), Events(after=0)))
+        await anext(coming)
+        await coming.aclose()
+        assert transport.ended
+
+    asyncio.run(follow())
+
+
 def test_a_download_that_breaks_goes_on_where_it_was(server: RunningServer, done: Any, tmp_path: Path) -> None:
     whole = done.result().content
     with cutting_proxy(server.url, limits=repeat(9000)) as (url, ranges), Client(url, max_retries=2) as client:
@@ -339,6 +414,19 @@ def test_a_server_of_another_kind_is_called_so() -> None:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         with Client(url) as client, pytest.raises(ConnectionFailed, match="no StraightPCF server"):
             client.info()
+
+
+def test_a_timeout_ends_a_call_whatever_the_server_does(client: Client) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # which accepts, and never answers
+        silent = Client(f"http://127.0.0.1:{listener.getsockname()[1]}")
+        job = client.jobs.create(SMALL, iterations=1)
+        there = Job(silent._transport, job.info)
+        for ask in (partial(silent.denoise, SMALL), there.wait):
+            began = time.monotonic()
+            with pytest.raises(JobNotFinished, match=r"after 0\.5 s"):
+                ask(timeout=0.5)
+            assert time.monotonic() - began < 20  # the farewell of `denoise` takes 5
+        job.delete()
 
 
 def test_a_bad_id_and_a_missing_folder_are_refused(client: Client, tmp_path: Path) -> None:

@@ -1,0 +1,20 @@
+"""Where the command line begins: a Ctrl-C while it is still being imported ends it as quietly as a later one."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line; the console script `straightpcf`."""
+    try:
+        from straightpcf.clients import cli
+    except KeyboardInterrupt:
+        sys.exit(130)
+    cli.main()
+
+
+if __name__ == "__main__":
+    main()
