@@ -22,6 +22,7 @@ StraightPCFError
 ├── JobCanceled
 ├── IdConflict              the id belongs to another request
 ├── IdempotencyConflict     the key belongs to another request
+├── PreconditionFailed      the result is not the one that was meant
 ├── RangeNotSatisfiable
 ├── DeviceUnavailable       the requested device is not here
 ├── ServerBusy              try again later
@@ -56,6 +57,7 @@ __all__ = [
     "MisdirectedRequest",
     "MissingDependency",
     "NotFound",
+    "PreconditionFailed",
     "QuotaExceeded",
     "RangeNotSatisfiable",
     "RateLimited",
@@ -242,6 +244,12 @@ class IdempotencyConflict(StraightPCFError):  # noqa: N818
     """Report an idempotency key that came with another request before."""
 
     code = "idempotency_conflict"
+
+
+class PreconditionFailed(StraightPCFError):  # noqa: N818
+    """Report that If-Match names another result than there is."""
+
+    code = "precondition_failed"
 
 
 class RangeNotSatisfiable(StraightPCFError):  # noqa: N818

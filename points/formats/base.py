@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import ClassVar
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile, TooManyPoints
+from straightpcf.points.errors import MalformedFile, TooManyBytes, TooManyPoints
 from straightpcf.points.formats.scalars import not_held
 
-__all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room"]
+__all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room", "check_unpacked"]
 
 DEFAULT_MAX_POINTS = 100_000_000
 HEAD_BYTES = 4096  # what `sniff` sees of a file
+SMALL_UNPACKED_BYTES = 256 << 20  # that a file of any size may unpack to
+MAX_UNPACKED_RATIO = 40  # of a larger one: aerial scans pack 6 to 20 to 1 as LAZ
 
 
 class Format(ABC):
@@ -48,7 +50,7 @@ class Format(ABC):
         return [*cloud.beside, *not_held(cloud.attributes, self.types)]
 
     def check(self, cloud: PointCloud) -> None:  # noqa: B027 - most formats hold every cloud
-        """Raise what `write` would of a cloud read of another format, wherever its points are then moved to."""
+        """Raise what `write` would of a cloud, of this or of another format, wherever its points are then moved to."""
 
     @abstractmethod
     def write(self, cloud: PointCloud, path: Path) -> None:
@@ -65,3 +67,10 @@ def check_room(needed: int, available: int, *, what: str) -> None:
     """Raise MalformedFile if `what` needs more bytes than the file still has, before memory is taken for it."""
     if needed > available:
         raise MalformedFile(f"{what} needs at least {needed} bytes, the file has {max(available, 0)}: it is truncated")
+
+
+def check_unpacked(unpacked: int, packed: int, *, what: str) -> None:
+    """Raise TooManyBytes where `what` declares more bytes than a file of `packed` ones may: a bomb takes all memory."""
+    limit = max(SMALL_UNPACKED_BYTES, MAX_UNPACKED_RATIO * packed)
+    if unpacked > limit:
+        raise TooManyBytes(f"{what} declares {unpacked} bytes unpacked; the limit for {packed} bytes is {limit}")

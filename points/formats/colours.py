@@ -13,6 +13,7 @@ __all__ = ["PACKED", "RGB", "in_8_bits", "in_16_bits", "packed", "unpacked"]
 
 RGB = ("red", "green", "blue")
 PACKED = ("rgb", "rgba")  # PCL's: the bytes of a 32 bit number, 0xAARRGGBB, often called a float
+_NO_COLOUR = np.uint32(0x7FC00000)  # NaN, which PCL has for points that are not there
 _TRIPLES = (RGB, ("r", "g", "b"))
 _Attributes = Mapping[str, npt.NDArray[Any]]
 
@@ -107,6 +108,8 @@ def _whole(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any] | None:
 def _of_packed(values: npt.NDArray[Any], others: dict[str, npt.NDArray[Any]]) -> _Colour:
     """Take (N,) numbers of 32 bits apart; the fourth byte is an attribute where it is not the same all over."""
     words = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<"))).view("<u4")
+    if values.dtype.kind == "f":
+        words = np.where(words == _NO_COLOUR, 0, words)
     alpha, *parts = ((words >> shift & 255).astype(np.uint8) for shift in (24, 16, 8, 0))
     says_nothing = not alpha.any() or bool((alpha == 255).all())
     return _Colour(np.stack(parts, axis=1), others if says_nothing else {**others, "alpha": alpha})

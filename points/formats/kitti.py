@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +41,10 @@ class Kitti(Format):
         return False
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read rows of four float32; the fourth is the attribute `intensity`."""
+        """Read rows of four float32; the fourth is the attribute `intensity`.
+
+        Raises UnsupportedCloud where it cannot be one: the rows are of three, five or six numbers then.
+        """
         size = path.stat().st_size
         check_count(size // ROW_BYTES, max_points, where=f"a KITTI frame of {size} bytes")
         if size % ROW_BYTES:
@@ -49,11 +53,12 @@ class Kitti(Format):
             )
         raw = path.read_bytes()
         rows = np.frombuffer(raw, "<f4").reshape(-1, 4)
+        _check_intensity(rows[:, 3])
         xyz = widened([rows[:, axis] for axis in range(3)])
         return PointCloud(xyz, {"intensity": rows[:, 3]}, KittiSource(raw, xyz.copy()))
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
-        """Name everything but positions and intensity, float32 as in every frame."""
+        """Name everything but positions and an intensity that a frame can have, float32 as in every frame."""
         held = "intensity" if _has_intensity(cloud) else None
         return [*cloud.beside, *(name for name in cloud.attributes if name != held)]
 
@@ -86,7 +91,26 @@ def _new_rows(cloud: PointCloud) -> npt.NDArray[np.float32]:
 
 def _has_intensity(cloud: PointCloud) -> bool:
     values = cloud.attributes.get("intensity")
-    return values is not None and values.ndim == 1 and values.dtype.kind in "biuf"
+    is_column = values is not None and values.ndim == 1 and values.dtype.kind in "biuf"
+    return is_column and bool(_are_intensities(cloud.attributes["intensity"]).all())
+
+
+def _check_intensity(values: npt.NDArray[np.float32]) -> None:
+    """Refuse the fourth numbers (N,) of what only divides into rows of four: it would be scrambled."""
+    are = _are_intensities(values)
+    if not are.all():
+        row = int(np.argmin(are))
+        raise UnsupportedCloud(
+            "a KITTI frame has four float32 a point, x, y, z and an intensity of 0..1 or 0..255; the fourth of "
+            f"point {row} is {values[row]:g}: rows of another length can be taken as (N, M) float32 in a .npy file"
+        )
+
+
+def _are_intensities(values: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Say of each of (N,) numbers whether it is finite and none below 0; tools disagree on how large it may be."""
+    with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
+        are: npt.NDArray[np.bool_] = np.isfinite(values) & (values >= 0)
+    return are
 
 
 def _check_rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[np.float32]) -> None:

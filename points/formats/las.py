@@ -76,7 +76,7 @@ class Las(Format):
         if not isinstance(source, LasSource):
             check_new(cloud)
         if self.is_compressed:
-            check_packing(source.header if isinstance(source, LasSource) else None)
+            check_packing(*((source.header, source.rows) if isinstance(source, LasSource) else ()))
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read, packed or not, with its moved points requantised; or a new one."""
@@ -92,7 +92,8 @@ class Las(Format):
         if is_new and header.is_compressed == self.is_compressed:
             path.write_bytes(raw)
         else:
-            path.write_bytes(_assembled(raw, header, rows, compressed=self.is_compressed, keep_bounds=is_new))
+            with path.open("wb") as file:  # part by part: joined, they would be held twice
+                file.writelines(_assembled(raw, header, rows, compressed=self.is_compressed, keep_bounds=is_new))
 
 
 class Laz(Las):
@@ -142,8 +143,8 @@ def _requantised(
 
 def _assembled(
     raw: bytes, header: LasHeader, rows: npt.NDArray[np.uint8], *, compressed: bool, keep_bounds: bool
-) -> bytes:
-    """Put the file together: header, records, points, and what follows them, with every offset where it now is."""
+) -> list[bytes | memoryview]:
+    """Return the file's parts: header, records, points, and what follows them, with every offset where it now is."""
     kept = [record.raw for record in header.records if (record.user_id, record.record_id) != LASZIP_ID]
     record = packing_record(header) if compressed else b""
     old = header.record(*LASZIP_ID)
@@ -154,14 +155,14 @@ def _assembled(
         prefix = struct.pack("<H16sHH32s", 0, LASZIP_ID[0], LASZIP_ID[1], len(record), b"straightpcf")
         records = [*kept, prefix + record]
     begin = len(header.head) + sum(map(len, records)) + len(header.gap)
-    points = pack(rows.tobytes(), record, begin) if compressed else rows.tobytes()
+    points: bytes | memoryview = pack(rows, record, begin) if compressed else rows.reshape(-1).data
     after, follows_at = _follows(raw, header)
     head = bytearray(header.head)
     struct.pack_into("<IIB", head, 96, begin, len(records), header.point_format | (0x80 if compressed else 0))
     _move_offsets(head, header, begin + len(points) - follows_at)
     if not keep_bounds:
         _put_bounds(head, header, rows)
-    return b"".join([head, *records, header.gap, points, after])
+    return [bytes(head), *records, header.gap, points, after]
 
 
 def _follows(raw: bytes, header: LasHeader) -> tuple[bytes, int]:

@@ -23,6 +23,7 @@ __all__ = [
     "read_header",
     "standard_bytes",
     "standard_dimensions",
+    "value_bytes",
 ]
 
 LASZIP_ID = (b"laszip encoded", 22204)
@@ -232,8 +233,14 @@ def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.
     return found
 
 
+def value_bytes(header: LasHeader) -> int:
+    """Return the bytes of a point once `dimensions` has read it: those of extra bytes with a scale become float64."""
+    extra = _extra_dimensions(header, standard_bytes(header.point_format))
+    return header.row_bytes + sum(8 for dimension in extra if not dimension.is_plain)
+
+
 def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    values: npt.NDArray[Any] = np.ascontiguousarray(rows[:, at : at + dtype.itemsize]).view(dtype)[:, 0]
+    values: npt.NDArray[Any] = rows[:, at : at + dtype.itemsize].view(dtype)[:, 0]
     return values
 
 

@@ -9,16 +9,18 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from straightpcf.points.errors import MalformedFile, MissingDependency, TooManyBytes, UnsupportedCloud
-from straightpcf.points.formats.base import check_room
-from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader
+from straightpcf.points.errors import MalformedFile, MissingDependency, UnsupportedCloud
+from straightpcf.points.formats.base import check_room, check_unpacked
+from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader, value_bytes
 
 __all__ = ["check_packing", "pack", "packing_record", "unpack"]
 
 VARIABLE_CHUNKS = 0xFFFFFFFF
-MAX_UNPACKED_BYTES = 4 << 30  # whatever the file's size: layers that never change take no byte at all
-MAX_USUAL_RATIO = 20  # scans pack 5 to 15 to 1; a file with more than MAX_UNPACKED_BYTES must be no better
+_WITH_WAVES = (4, 5, 9, 10)  # point formats
+_TRIAL_POINTS = 50_000  # a chunk
+_STEP_BYTES = 4 << 20  # that are packed, and unpacked again to be compared, at a time
 _POINTWISE, _LAYERED = 2, 3
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # item type -> layers of one chunk; type 14, extra bytes, has one a byte
 
@@ -53,7 +55,9 @@ def unpack(raw: bytes, header: LasHeader) -> bytearray:
     if record is None:
         raise MalformedFile("a LAZ file without a laszip record: nothing says how its points are packed")
     chunk_size = _check_record(record.data, header)
-    _check_unpacked(header.points * header.row_bytes, len(raw))
+    # A few kilobytes can be valid and unpack to hundreds of gigabytes: layers that never change take no byte at all.
+    size = header.points * value_bytes(header)
+    check_unpacked(size, len(raw), what=f"the LAS header of {header.points} packed points")
     _check_chunk_table(raw, header, chunk_size)
     with _converted():
         lazrs.LazVlr(record.data)
@@ -84,33 +88,44 @@ def packing_record(header: LasHeader) -> bytes:
     return bytes(lazrs.LazVlr.new_for_compression(header.point_format, extra).record_data())
 
 
-def check_packing(header: LasHeader | None) -> None:
-    """Raise MissingDependency without lazrs, UnsupportedCloud where it cannot pack such points; None: new ones."""
+def check_packing(header: LasHeader | None = None, rows: npt.NDArray[np.uint8] | None = None) -> None:
+    """Raise MissingDependency without lazrs, UnsupportedCloud where it cannot pack such points; None: new ones.
+
+    Some wave packets come out of lazrs changed: a chunk of them is packed as a trial.
+    """
     _lazrs()
-    if header is not None:
-        packing_record(header)
+    if header is None or rows is None:
+        return
+    record = packing_record(header)
+    if header.point_format in _WITH_WAVES:
+        pack(rows[:_TRIAL_POINTS], record, 0)
 
 
-def pack(points: bytes, record: bytes, begin: int) -> bytes:
-    """Pack points; the chunk table's place counts from the file's start, and the points begin at byte `begin`.
+def pack(rows: npt.NDArray[np.uint8], record: bytes, begin: int) -> bytes:
+    """Pack points (N, row_bytes); the chunk table's place counts from the file's start, the points begin at `begin`.
 
     Raises UnsupportedCloud where they do not unpack to the same bytes: lazrs 0.8 loses bits of some wave packets.
     """
     lazrs = _lazrs()
+    step = max(_STEP_BYTES // rows.shape[1], 1)
     sink = BytesIO(bytes(begin))
     sink.seek(begin)
     with _converted():
         packer = lazrs.LasZipCompressor(sink, lazrs.LazVlr(record))
-        packer.compress_many(points)
+        for first in range(0, len(rows), step):
+            packer.compress_many(rows[first : first + step].reshape(-1))
         packer.done()
         sink.seek(begin)
-        again = bytearray(len(points))
-        if points:
-            lazrs.LasZipDecompressor(sink, record).decompress_many(again)
-    if again != points:
-        differs = np.frombuffer(again, np.uint8) != np.frombuffer(points, np.uint8)
-        row = int(np.argmax(differs)) // sum(size for _, size, _ in _items(record))
-        raise UnsupportedCloud(f"lazrs cannot pack point {row} as LAZ without loss; write LAS")
+        unpacker: Any = lazrs.LasZipDecompressor(sink, record) if len(rows) else None
+    for first in range(0, len(rows), step):
+        block = rows[first : first + step]
+        again = np.empty_like(block)
+        with _converted():
+            unpacker.decompress_many(again.reshape(-1))
+        differs = (again != block).any(axis=1)
+        if differs.any():
+            row = first + int(np.argmax(differs))
+            raise UnsupportedCloud(f"lazrs cannot pack point {row} as LAZ without loss; write LAS")
     return sink.getvalue()[begin:]
 
 
@@ -134,13 +149,6 @@ def _check_record(record: bytes, header: LasHeader) -> int:
     if chunk_size == 0:
         raise MalformedFile("the laszip record declares chunks of 0 points")
     return int(chunk_size)
-
-
-def _check_unpacked(unpacked: int, packed: int) -> None:
-    """Refuse a bomb: a few kilobytes of LAZ can be valid and unpack to hundreds of gigabytes."""
-    limit = max(MAX_UNPACKED_BYTES, MAX_USUAL_RATIO * packed)
-    if unpacked > limit:
-        raise TooManyBytes(f"the LAZ points declare {unpacked} bytes unpacked; the limit for {packed} bytes is {limit}")
 
 
 def _check_chunk_table(raw: bytes, header: LasHeader, chunk_size: int) -> None:

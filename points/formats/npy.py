@@ -1,4 +1,4 @@
-"""NPY: one (N, >= 3) array of floats; type, memory order and further columns are kept."""
+"""NPY: one (N, >= 3) array of floats, or records with x, y, z; type, memory order and further columns are kept."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from straightpcf.points.formats.npy_array import (
     HEADER_BYTES,
     MAGIC,
     NpyHeader,
+    columns_of,
     new_array,
     patched,
     positions_header,
-    view,
 )
 from straightpcf.points.formats.positions import widened
-from straightpcf.points.formats.scalars import further_columns
 
 __all__ = ["Npy"]
 
@@ -46,16 +45,19 @@ class Npy(Format):
         return head.startswith(MAGIC)
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read the first three columns; further ones become attributes column_4, column_5, ..."""
+        """Read the first three columns; further ones become attributes column_4, column_5, ...
+
+        Of records, the fields x, y, z are the positions, and the others attributes.
+        """
         with path.open("rb") as file:
             header = positions_header(file.read(HEADER_BYTES), where="the array", max_points=max_points)
             there = path.stat().st_size - header.size
             check_room(header.data_bytes, there, what=f"an array of shape {header.shape}")
             file.seek(0)
             raw = file.read()
-        rows = view(raw, header)
-        xyz = widened([rows[:, axis] for axis in range(3)])
-        return PointCloud(xyz, further_columns(rows), NpySource(raw, header, xyz.copy()))
+        axes, attributes, beside = columns_of(raw, header)
+        xyz = widened(axes)
+        return PointCloud(xyz, attributes, NpySource(raw, header, xyz.copy()), beside=beside)
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name everything but the positions."""

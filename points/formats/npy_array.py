@@ -14,12 +14,24 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_count, check_room
 from straightpcf.points.formats.positions import AXES, put_positions
+from straightpcf.points.formats.scalars import further_columns
 
-__all__ = ["HEADER_BYTES", "MAGIC", "NpyHeader", "new_array", "patched", "positions_header", "read_header", "view"]
+__all__ = [
+    "HEADER_BYTES",
+    "MAGIC",
+    "NpyHeader",
+    "columns_of",
+    "new_array",
+    "patched",
+    "positions_header",
+    "read_header",
+    "view",
+]
 
 MAGIC = b"\x93NUMPY"
 HEADER_BYTES = 10_000 + 12  # what numpy itself takes of a header, and what stands before it
 MAX_COLUMNS = 4096
+_AXES = (("x", "y", "z"), ("X", "Y", "Z"))
 _FLOATS = re.compile(r"[<>=|]?f[248]")
 _PYTHON_2 = re.compile(r"(\d)L(?=[,)])")  # (400L, 3L)
 _PLAIN = re.compile(r"[<>=|]?([biufc][1-9][0-9]?|[SU][1-9][0-9]{0,4})")
@@ -27,18 +39,32 @@ _PLAIN = re.compile(r"[<>=|]?([biufc][1-9][0-9]?|[SU][1-9][0-9]{0,4})")
 
 @dataclass(frozen=True)
 class NpyHeader:
-    """Describe an array; size: bytes before its data.  descr: as written, a string or a list."""
+    """Describe an array; size: bytes before its data.  descr: as written, a string, or a list of a record's fields."""
 
-    descr: object
+    descr: Any  # of whatever type a literal has
     shape: tuple[int, ...]
     fortran: bool
     size: int
 
     @property
     def is_positions(self) -> bool:
-        """Say whether this is an (N, >= 3) array of 16, 32 or 64 bit floats."""
+        """Say whether this is an (N, >= 3) array of 16, 32 or 64 bit floats, or (N,) records with such x, y, z."""
+        if self.axes is not None:
+            return True
         is_float = isinstance(self.descr, str) and _FLOATS.fullmatch(self.descr) is not None
         return is_float and len(self.shape) == 2 and self.shape[1] >= 3
+
+    @property
+    def axes(self) -> tuple[str, str, str] | None:
+        """Name the positions' fields in (N,) records; None of another array."""
+        if not isinstance(self.descr, list) or len(self.shape) != 1:
+            return None
+        try:
+            fields = self.dtype
+        except (TypeError, ValueError, SyntaxError, RecursionError):
+            return None
+        floats = {name for name in fields.names or () if _FLOATS.fullmatch(fields[name].str)}
+        return next((three for three in _AXES if floats.issuperset(three)), None)
 
     def is_attribute_of(self, count: int) -> bool:
         """Say whether this holds plain numbers or texts, one row for each of `count` points and not too wide."""
@@ -49,7 +75,7 @@ class NpyHeader:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Return the type of an array that `is_positions` or `is_attribute_of` some."""
-        return np.dtype(str(self.descr))
+        return np.lib.format.descr_to_dtype(self.descr)
 
     @property
     def data_bytes(self) -> int:
@@ -89,15 +115,42 @@ def positions_header(head: bytes, *, where: str, max_points: int) -> NpyHeader:
     """Parse a header that must be of an (N, >= 3) float array of at most `max_points` rows."""
     header = read_header(head, where=where)
     descr = str(header.descr)[:60]
-    if "O" in descr:
+    if _has_objects(header.descr):
         raise UnsupportedCloud(f"{where} holds Python objects ({descr}); they are never unpickled")
     if not header.is_positions:
         shape = str(header.shape)[:60]
-        raise UnsupportedCloud(f"{where} has shape {shape} and type {descr}; positions are (N, >= 3) floats f2, f4, f8")
-    if header.shape[1] > MAX_COLUMNS:
+        raise UnsupportedCloud(
+            f"{where} has shape {shape} and type {descr}; positions are (N, >= 3) floats f2, f4, f8"
+            ", or (N,) records with such x, y, z"
+        )
+    if header.axes is None and header.shape[1] > MAX_COLUMNS:
         raise UnsupportedCloud(f"{where} has {header.shape[1]} columns; the limit is {MAX_COLUMNS}")
     check_count(header.shape[0], max_points, where=where)
     return header
+
+
+def _has_objects(descr: object) -> bool:
+    """Look for the type code of Python objects in a type as written: a text, or a list of (name, type, ...)."""
+    if isinstance(descr, str):
+        return descr.lstrip("<>=|").startswith("O")
+    fields = descr if isinstance(descr, list) else []
+    return any(_has_objects(field[1]) for field in fields if isinstance(field, tuple) and len(field) > 1)
+
+
+def columns_of(
+    raw: bytes | bytearray, header: NpyHeader
+) -> tuple[list[npt.NDArray[Any]], dict[str, npt.NDArray[Any]], tuple[str, ...]]:
+    """View the three (N,) columns of positions behind a header, those beside them, and which fields are none."""
+    table = view(raw, header)
+    if header.axes is None:
+        return [table[:, axis] for axis in range(3)], further_columns(table), ()
+    fields = {name: table[name] for name in header.dtype.names or () if name not in header.axes}
+    plain = {name: values for name, values in fields.items() if _is_plain(values)}
+    return [table[name] for name in header.axes], plain, tuple(name for name in fields if name not in plain)
+
+
+def _is_plain(values: npt.NDArray[Any]) -> bool:
+    return values.dtype.kind in "biufcSU" and values.ndim <= 2 and math.prod(values.shape[1:]) <= MAX_COLUMNS
 
 
 def view(raw: bytes | bytearray, header: NpyHeader) -> npt.NDArray[Any]:
@@ -113,8 +166,8 @@ def patched(
     if not len(new):
         return raw
     out = bytearray(raw)
-    table = view(out, header)
-    put_positions({name: table[:, axis] for axis, name in enumerate(AXES)}, new, old)
+    axes, *_ = columns_of(out, header)
+    put_positions(dict(zip(AXES, axes, strict=True)), new, old)
     return out
 
 

@@ -21,17 +21,18 @@ from straightpcf.points.formats.npy_array import (
     HEADER_BYTES,
     MAGIC,
     NpyHeader,
+    columns_of,
     patched,
     positions_header,
     read_header,
     view,
 )
 from straightpcf.points.formats.positions import moved, widened
-from straightpcf.points.formats.scalars import further_columns
 
 __all__ = ["KEYS", "MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
 
-KEYS = ("points", "xyz", "pos")
+KEYS = ("points", "xyz", "pos", "positions", "coord", "coords", "vertices")
+_NO_POSITIONS = ("normal", "color", "colour")  # how names of arrays begin that are (N, 3) as well
 MAX_MEMBERS = 1000
 MAX_UNPACKED_BYTES = 4 << 30
 MAX_ATTRIBUTE_BYTES = 4096  # of a point: what is beyond stays packed, as arrays that are no attributes do
@@ -50,7 +51,7 @@ class NpzSource:
 
 
 class Npz(Format):
-    """Read and write NPZ; the positions are the array `points`, `xyz` or `pos`, or the only (N, >= 3) float array."""
+    """Read and write NPZ; the positions are the first of KEYS that can be, or the only array (N, >= 3)."""
 
     name = "npz"
     suffixes = (".npz",)
@@ -69,9 +70,8 @@ class Npz(Format):
             where = f"array {member.filename[:80]}"
             header = positions_header(_head(archive, member), where=where, max_points=max_points)
             array = _unpacked(archive, member, header)
-            rows = view(array, header)
-            xyz = widened([rows[:, axis] for axis in range(3)])
-            attributes = further_columns(rows)
+            axes, attributes, fields = columns_of(array, header)
+            xyz = widened(axes)
             room = MAX_ATTRIBUTE_BYTES * len(xyz)
             for other in members:
                 head = b"" if other is member else _head(archive, other)
@@ -83,7 +83,9 @@ class Npz(Format):
                     attributes[_key(other)] = view(_unpacked(archive, other, found), found)
             known = {member.filename, *(f"{name}.npy" for name in attributes)}
             others = tuple(info.filename for info in archive.infolist() if info.filename not in known)
-        return PointCloud(xyz, attributes, NpzSource(raw, member.filename, array, header, xyz.copy()), beside=others)
+        return PointCloud(
+            xyz, attributes, NpzSource(raw, member.filename, array, header, xyz.copy()), beside=(*fields, *others)
+        )
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name what no array of the archive can be called."""
@@ -105,11 +107,14 @@ class Npz(Format):
 
 @contextmanager
 def _opened(raw: bytes) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; what zipfile and zlib find wrong with it becomes MalformedFile, here and only here."""
+    """Open an archive; what zipfile and zlib find wrong with it becomes MalformedFile, here and only here.
+
+    An OSError is none of these: the archive is in memory, so it is of the disk that it is written anew to.
+    """
     try:
         with zipfile.ZipFile(BytesIO(raw)) as archive:
             yield archive
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, RuntimeError, ValueError) as exc:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as exc:
         raise MalformedFile(f"the NPZ archive is broken: {exc}") from exc
 
 
@@ -133,22 +138,25 @@ def _members(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 
 def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
-    by_name = {member.filename: member for member in members}
-    for key in KEYS:
-        if f"{key}.npy" in by_name:
-            return by_name[f"{key}.npy"]
-    fitting = []
-    for member in members:
-        head = _head(archive, member)
-        if head.startswith(MAGIC) and read_header(head, where=f"array {member.filename[:80]}").is_positions:
-            fitting.append(member)
-    if len(fitting) != 1:
-        names = ", ".join(_key(member) for member in (fitting or members))[:200]
-        raise UnsupportedCloud(
-            f"the NPZ archive has {len(fitting)} arrays of shape (N, >= 3), and none named {', '.join(KEYS)}: "
-            f"{names or 'no arrays at all'}"
-        )
-    return fitting[0]
+    fitting = {_key(member): member for member in members if _can_be_positions(archive, member)}
+    named = next((key for key in KEYS if key in fitting), None)
+    if named or len(fitting) == 1:
+        return fitting[named or next(iter(fitting))]
+    by_name = {_key(member): member for member in members}
+    called = next((key for key in KEYS if key in by_name), None)
+    if called and not fitting:
+        return by_name[called]  # reading it says what is wrong with it
+    raise UnsupportedCloud(
+        f"the NPZ archive has {len(fitting)} arrays of shape (N, >= 3), and none named {', '.join(KEYS)}: "
+        f"{', '.join(fitting or by_name)[:200] or 'no arrays at all'}"
+    )
+
+
+def _can_be_positions(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bool:
+    head = _head(archive, member)
+    if not head.startswith(MAGIC) or _key(member).lower().startswith(_NO_POSITIONS):
+        return False
+    return read_header(head, where=f"array {member.filename[:80]}").is_positions
 
 
 def _head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
@@ -190,7 +198,7 @@ def _rewrite(source: NpzSource, xyz: npt.NDArray[np.float64], path: Path) -> Non
 
 
 def _is_array(name: str, values: npt.NDArray[Any]) -> bool:
-    return name not in KEYS and "/" not in name and not values.dtype.hasobject
+    return name != KEYS[0] and "/" not in name and not values.dtype.hasobject
 
 
 def _write_new(cloud: PointCloud, path: Path) -> None:

@@ -15,7 +15,7 @@ from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.colours import PACKED, packed
-from straightpcf.points.formats.pcd_header import PcdHeader, read_header
+from straightpcf.points.formats.pcd_header import PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
@@ -43,7 +43,7 @@ class PcdSource:
 
 
 class Pcd(Format):
-    """Read and write PCD; x, y and z must be fields of one float."""
+    """Read and write PCD; x, y and z, or X, Y and Z, must be fields of one float."""
 
     name = "pcd"
     suffixes = (".pcd",)
@@ -68,8 +68,9 @@ class Pcd(Format):
             return _read_ascii(raw, header)
         unpacked = _unpacked(raw, header) if header.encoding == "binary_compressed" else None
         columns = _columns(raw, header) if unpacked is None else _planes(unpacked, header)
-        xyz = widened([columns[axis] for axis in AXES])
-        return PointCloud(xyz, _attributes(columns), PcdSource(raw, header, xyz.copy(), unpacked=unpacked))
+        xyz = widened([columns[axis] for axis in header.axes])
+        source = PcdSource(raw, header, xyz.copy(), unpacked=unpacked)
+        return PointCloud(xyz, _attributes(columns, header), source, beside=header.beside)
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with its positions replaced, or a new binary one."""
@@ -77,7 +78,7 @@ class Pcd(Format):
         if not isinstance(source, PcdSource):
             path.write_bytes(_new_file(cloud))
             return
-        names, new, old = changes(cloud, source.xyz)
+        names, new, old = changes(cloud, source.xyz, source.header.axes)
         if not moved(new, old).any():
             path.write_bytes(source.raw)
         elif source.tokens is not None:
@@ -92,8 +93,8 @@ class Pcd(Format):
             path.write_bytes(out)
 
 
-def _attributes(columns: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    return {name: values for name, values in columns.items() if name not in AXES and name.strip("_")}
+def _attributes(columns: dict[str, npt.NDArray[Any]], header: PcdHeader) -> dict[str, npt.NDArray[Any]]:
+    return {name: values for name, values in columns.items() if name not in header.axes and name.strip("_")}
 
 
 def _columns(raw: bytes | bytearray, header: PcdHeader) -> dict[str, npt.NDArray[Any]]:
@@ -153,7 +154,7 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         what=f"PCD data of {header.points} points with {width} values",
     )
     parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
-    kept = {field.label for field in header.fields if field.label in AXES or field.label in _NORMAL_FIELDS}
+    kept = {field.label for field in header.fields if field.label in header.axes or field.label in _NORMAL_FIELDS}
     tokens: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]] = {name: [] for name in kept}
     left, line = header.points, header.lines + 1
     for lines, _ in blocks(raw, header.size) if left else ():
@@ -168,9 +169,8 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         for field in header.fields:
             index = (rows.first[:, None] + np.arange(at, at + field.count)).reshape(-1)
             columns[field.label] = rows.starts[index], rows.ends[index]
-            read = as_numbers if field.dtype.kind == "f" else None
             first, last = columns[field.label]
-            values, bad = read(raw, first, last) if read else as_integers(raw, first, last, field.dtype)
+            values, bad = _text_values(raw, first, last, field)
             if bad is not None:
                 token = shown(raw[first[bad] : last[bad]])
                 number = numbers[bad // field.count]
@@ -191,16 +191,29 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         for field in header.fields
     }
     for name in PACKED:  # four bytes that are called a float, and may come from a number of text
-        if name in found and found[name].dtype.kind == "f" and np.isfinite(found[name]).all():
-            found[name] = found[name].astype(np.float32)
-    xyz = widened([found[axis] for axis in AXES])
+        if name in found and found[name].dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                found[name] = np.where(np.isnan(found[name]), np.nan, found[name]).astype(np.float32)
+    xyz = widened([found[axis] for axis in header.axes])
     none = np.empty(0, np.int64)
     where = {
         name: (np.concatenate([none, *(p[0] for p in parts)]), np.concatenate([none, *(p[1] for p in parts)]))
         for name, parts in tokens.items()
     }
     source = PcdSource(raw, header, xyz.copy(), where)
-    return PointCloud(xyz, _attributes(found), source)
+    return PointCloud(xyz, _attributes(found, header), source, beside=header.beside)
+
+
+def _text_values(
+    raw: bytes, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64], field: PcdField
+) -> tuple[npt.NDArray[Any], int | None]:
+    if field.dtype.kind == "f":
+        return as_numbers(raw, first, last)
+    if field.label in PACKED and field.dtype == np.int32:  # a colour with alpha is often written as if it had no sign
+        values, bad = as_integers(raw, first, last, np.dtype("<u4"))
+        if bad is None:
+            return values.view("<i4"), None
+    return as_integers(raw, first, last, field.dtype)
 
 
 def _position_type(xyz: npt.NDArray[np.float64]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.formats.positions import axes_among
 from straightpcf.points.formats.text import shown
 
 __all__ = ["PcdField", "PcdHeader", "read_header"]
@@ -30,13 +31,18 @@ class PcdField:
 
 @dataclass(frozen=True)
 class PcdHeader:
-    """Describe the file; size: bytes up to the data.  lines: of the header."""
+    """Describe the file; size: bytes up to the data.  lines: of the header.
+
+    axes: what it calls x, y and z.  beside: what else it says of the cloud that no other format has a place for.
+    """
 
     fields: tuple[PcdField, ...]
     points: int
     encoding: str
     size: int
     lines: int
+    axes: tuple[str, ...]
+    beside: tuple[str, ...]
 
     @property
     def row_dtype(self) -> np.dtype[Any]:
@@ -52,7 +58,7 @@ def read_header(raw: bytes) -> PcdHeader:
         end = raw.find(b"\n", begin, MAX_HEADER_BYTES)
         if end < 0:
             reason = f"has more than {MAX_HEADER_BYTES} bytes, the limit" if len(raw) > MAX_HEADER_BYTES else "ends"
-            raise MalformedFile(f"the PCD header {reason} in line {number + 1}, before DATA")
+            raise MalformedFile(f"the PCD header {reason} in line {number + 1}, before DATA{_and_unknown(entries)}")
         number += 1
         line, begin = raw[begin:end].strip(), end + 1
         if not line or line.startswith(b"#"):
@@ -60,23 +66,58 @@ def read_header(raw: bytes) -> PcdHeader:
         try:
             keyword, *words = line.decode("ascii").split()
         except UnicodeDecodeError as exc:
-            raise MalformedFile(f"line {number} of the PCD header is not ASCII: {shown(line)}") from exc
+            raise MalformedFile(
+                f"line {number} of the PCD header is not ASCII: {shown(line)}{_and_unknown(entries)}"
+            ) from exc
         keyword = "FIELDS" if keyword == "COLUMNS" else keyword  # its name in old files
-        if keyword not in _KEYWORDS or keyword in entries:
-            raise MalformedFile(f"line {number} of the PCD header is unknown or there twice: {shown(line)}")
+        if keyword in entries:
+            raise MalformedFile(f"line {number} of the PCD header is there twice: {shown(line)}")
+        if keyword not in _KEYWORDS and keyword.upper().startswith(
+            _KEYWORDS
+        ):  # COUNTS: without it, rows would be short
+            raise MalformedFile(f"line {number} of the PCD header is unknown, but nearly a known one: {shown(line)}")
         entries[keyword] = words
-    fields = _fields(entries)
+    axes = axes_among(entries.get("FIELDS", []))
+    fields = _fields(entries, axes)
     encoding = " ".join(entries["DATA"])
     if encoding not in _ENCODINGS:
         raise MalformedFile(f"PCD DATA is {encoding[:40]!r}; it must be one of {', '.join(_ENCODINGS)}")
-    return PcdHeader(fields, _points(entries), encoding, begin, number)
+    return PcdHeader(fields, _points(entries), encoding, begin, number, axes, _beside(entries))
 
 
-def _fields(entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
+def _beside(entries: dict[str, list[str]]) -> tuple[str, ...]:
+    """Name an organised shape, a sensor's place, and lines that only the program that wrote them knows."""
+    found = []
+    if entries.get("HEIGHT", ["1"]) != ["1"]:
+        found.append(f"organised shape {' '.join(entries['WIDTH'])} x {' '.join(entries['HEIGHT'])}")
+    viewpoint = entries.get("VIEWPOINT", [])
+    if viewpoint and not _is_identity(viewpoint):
+        found.append(f"viewpoint {' '.join(viewpoint)}")
+    return (*found, *(f"header line {keyword}" for keyword in _unknown(entries)))
+
+
+def _unknown(entries: dict[str, list[str]]) -> list[str]:
+    return [keyword for keyword in entries if keyword not in _KEYWORDS]
+
+
+def _and_unknown(entries: dict[str, list[str]]) -> str:
+    """Say which keywords no reader knows, one of which may be a known one that is misspelt."""
+    found = ", ".join(shown(keyword.encode()) for keyword in _unknown(entries)[:4])
+    return f"; its unknown lines are {found}" if found else ""
+
+
+def _is_identity(viewpoint: list[str]) -> bool:
+    try:
+        return [float(number) for number in viewpoint] == [0, 0, 0, 1, 0, 0, 0]
+    except ValueError:
+        return False
+
+
+def _fields(entries: dict[str, list[str]], axes: tuple[str, ...]) -> tuple[PcdField, ...]:
     """Read the fields; as PCL does, take those of an old file without SIZE and TYPE for float32."""
     for keyword in ("FIELDS",) if {"SIZE", "TYPE"}.isdisjoint(entries) else ("FIELDS", "SIZE", "TYPE"):
         if keyword not in entries:
-            raise MalformedFile(f"the PCD header has no {keyword}")
+            raise MalformedFile(f"the PCD header has no {keyword}{_and_unknown(entries)}")
     names = entries["FIELDS"]
     sizes, kinds = entries.get("SIZE", ["4"] * len(names)), entries.get("TYPE", ["F"] * len(names))
     counts = entries.get("COUNT", ["1"] * len(names))
@@ -94,7 +135,7 @@ def _fields(entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
         used.add(label)
         fields.append(_field(label, size, kind, count))
     by_label = {field.label: field for field in fields}
-    for axis in ("x", "y", "z"):
+    for axis in axes:
         if axis not in by_label:
             raise MalformedFile(f"PCD FIELDS are {' '.join(names)[:200]}; there is no {axis}")
         if axis + "_" in by_label and names.count(axis) > 1:
@@ -108,7 +149,7 @@ def _fields(entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
 
 
 def _field(label: str, size: str, kind: str, count: str) -> PcdField:
-    letter, sizes = _KINDS.get(kind, ("", ()))
+    letter, sizes = _KINDS.get(kind.upper(), ("", ()))
     if size not in [str(known) for known in sizes]:
         raise MalformedFile(
             f"PCD field {label[:40]} has TYPE {kind[:40]!r} of SIZE {size[:40]!r}, which does not exist"
@@ -125,7 +166,7 @@ def _points(entries: dict[str, list[str]]) -> int:
     if "HEIGHT" not in entries and "POINTS" in entries:
         texts.setdefault("WIDTH", texts["POINTS"])
     if "WIDTH" not in texts:
-        raise MalformedFile("the PCD header has no WIDTH")
+        raise MalformedFile(f"the PCD header has no WIDTH{_and_unknown(entries)}")
     width, height = (_whole(texts[key], f"PCD {key}") for key in ("WIDTH", "HEIGHT"))
     points = _whole(texts["POINTS"], "PCD POINTS") if "POINTS" in texts else width * height
     if points != width * height:

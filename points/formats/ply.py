@@ -13,10 +13,11 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import in_8_bits
-from straightpcf.points.formats.ply_header import PlyElement, PlyHeader, read_header
-from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows
+from straightpcf.points.formats.ply_header import BOM, PlyElement, PlyHeader, read_header
+from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows, scalar_offsets
 from straightpcf.points.formats.positions import (
     AXES,
+    axes_among,
     changes,
     gathered,
     moved,
@@ -36,17 +37,21 @@ _NAMES |= {"f4": "float", "f8": "double"}
 
 @dataclass(frozen=True)
 class PlySource:
-    """Hold the whole file, where its vertices stand, and the positions that were read from it."""
+    """Hold the whole file, where its vertices stand, what it calls their axes, and the positions that were read."""
 
     raw: bytes
     begin: int
     rows: AsciiRows | BinaryRows
     vertex: PlyElement
     xyz: npt.NDArray[np.float64]
+    axes: tuple[str, ...]
 
 
 class Ply(Format):
-    """Read and write PLY; x, y and z of the element `vertex` must be scalar float or double properties."""
+    """Read and write PLY; x, y and z (or X, Y and Z) of the element `vertex` must be scalars.
+
+    Whole numbers are read for conversions only: the points' own file has no place for where they move to.
+    """
 
     name = "ply"
     suffixes = (".ply",)
@@ -56,50 +61,68 @@ class Ply(Format):
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the first line."""
-        return head[:4] in (b"ply\n", b"ply\r") or head[:5] in (b"ply \n", b"ply \r")
+        return head.removeprefix(BOM).startswith((b"ply\n", b"ply\r", b"ply \n", b"ply \r"))
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read the vertices; scalar properties become attributes."""
         raw = path.read_bytes()
         header = read_header(raw)
-        vertex = _vertex(header)
+        vertex, axes = _vertex(header)
         check_count(vertex.count, max_points, where="element vertex")
         begin, rows = _find(raw, header, vertex)
         values = rows.values if isinstance(rows, AsciiRows) else _values(raw, vertex, rows)
-        xyz = widened([values[axis] for axis in AXES])
-        attributes = {name: value for name, value in values.items() if name not in AXES}
+        xyz = widened([values[axis] for axis in axes])
+        attributes = {name: value for name, value in values.items() if name not in axes}
         lists = [f"list {p.name}" for p in vertex.properties if p.counter is not None]
         others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
-        source = PlySource(raw, begin, rows, vertex, xyz.copy())
+        source = PlySource(raw, begin, rows, vertex, xyz.copy(), axes)
         return PointCloud(xyz, attributes, source, beside=(*lists, *others))
+
+    def check(self, cloud: PointCloud) -> None:
+        """Raise UnsupportedCloud where the file's own positions are whole numbers, which moved ones are not."""
+        if not isinstance(cloud.source, PlySource):
+            return
+        for prop in cloud.source.vertex.properties:
+            if prop.name in cloud.source.axes and prop.dtype.kind != "f":
+                raise UnsupportedCloud(
+                    f"property {prop.name} of element vertex is {prop.dtype.name}, which has no place for where points "
+                    "move to: ask for another format, or save the file with float or double positions"
+                )
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with its positions replaced, or a new binary one."""
         source = cloud.source
         if not isinstance(source, PlySource):
             path.write_bytes(_new_file(cloud))
-        elif isinstance(source.rows, AsciiRows):
-            names, new, old = changes(cloud, source.xyz)
+            return
+        names, new, old = changes(cloud, source.xyz, source.axes)
+        if not moved(new, old).any():
+            path.write_bytes(source.raw)
+            return
+        self.check(cloud)
+        if isinstance(source.rows, AsciiRows):
             starts = np.stack([source.rows.starts[name] for name in names], axis=1)
             ends = np.stack([source.rows.ends[name] for name in names], axis=1)
             path.write_bytes(replaced(source.raw, starts, ends, new, old))
         else:
-            path.write_bytes(_patched(source, source.rows, *changes(cloud, source.xyz)))
+            path.write_bytes(_patched(source, source.rows, names, new, old))
 
 
-def _vertex(header: PlyHeader) -> PlyElement:
+def _vertex(header: PlyHeader) -> tuple[PlyElement, tuple[str, ...]]:
+    """Return the element of the points, and what it calls their axes."""
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
         names = ", ".join(element.name for element in header.elements)[:200]
         raise MalformedFile(f"the PLY file has no element vertex; its elements are: {names or 'none'}")
     properties = {p.name: p for p in vertex.properties}
-    for axis in AXES:
+    for axis in (axes := axes_among(properties)):
         if axis not in properties:
             raise MalformedFile(f"element vertex has no property {axis}")
-        if properties[axis].counter is not None or properties[axis].dtype.kind != "f":
-            kind = "a list" if properties[axis].counter is not None else properties[axis].dtype.name
-            raise UnsupportedCloud(f"property {axis} of element vertex is {kind}; moved points need float or double")
-    return vertex
+        is_list, dtype = properties[axis].counter is not None, properties[axis].dtype
+        if is_list or (dtype.kind != "f" and dtype.itemsize > 4):  # float64 is too short for 64 bits
+            kind = "a list" if is_list else dtype.name
+            raise UnsupportedCloud(f"property {axis} of element vertex is {kind}; it must be float or double")
+    return vertex, axes
 
 
 def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, AsciiRows | BinaryRows]:
@@ -114,7 +137,7 @@ def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, Ascii
             rows = ascii_rows(raw, at, element, line, keep=element is vertex)
             line = rows.line
         else:
-            rows = binary_rows(raw, at, element)
+            rows = binary_rows(raw, at, element, keep=element is vertex)
         if element is vertex:
             found = at, rows
         at = rows.end
@@ -124,10 +147,9 @@ def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, Ascii
 
 
 def _values(raw: bytes, vertex: PlyElement, rows: BinaryRows) -> dict[str, npt.NDArray[Any]]:
-    scalars = [p for p in vertex.properties if p.counter is None]
     if rows.fixed is not None:
-        return {p.name: rows.fixed[p.name] for p in scalars}
-    return {p.name: gathered(raw, rows.offsets[p.name], p.dtype) for p in scalars}
+        return {p.name: rows.fixed[p.name] for p in vertex.properties}
+    return {p.name: gathered(raw, offsets, p.dtype) for p, offsets in scalar_offsets(raw, rows.begins, vertex)}
 
 
 def _patched(
@@ -136,20 +158,19 @@ def _patched(
     names: tuple[str, ...],
     new: npt.NDArray[np.float64],
     old: npt.NDArray[np.float64],
-) -> bytes | bytearray:
+) -> bytearray:
     changed = moved(new, old)
-    if not changed.any():
-        return source.raw
     out = bytearray(source.raw)
     if rows.fixed is not None:
         table = np.frombuffer(out, rows.fixed.dtype, len(rows.fixed), source.begin)
         put_positions({name: table[name] for name in names}, new, old, names)
         return out
-    kinds = {p.name: p.dtype for p in source.vertex.properties}
-    for column, name in enumerate(names):
-        picked = changed[:, column]
-        values = narrowed(new[picked, column], kinds[name], what=f"the new {name}")
-        scattered(out, rows.offsets[name][picked], values)
+    for prop, offsets in scalar_offsets(source.raw, rows.begins, source.vertex):
+        if prop.name in names:
+            column = names.index(prop.name)
+            picked = changed[:, column]
+            values = narrowed(new[picked, column], prop.dtype, what=f"the new {prop.name}")
+            scattered(out, offsets[picked], values)
     return out
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.text import shown
 
-__all__ = ["MAX_HEADER_BYTES", "MAX_LINE_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "read_header"]
+__all__ = ["BOM", "MAX_HEADER_BYTES", "MAX_LINE_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "read_header"]
 
+BOM = b"\xef\xbb\xbf"  # that editors put before a text
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 16
 MAX_ELEMENTS = 1024
@@ -69,7 +70,7 @@ class PlyHeader:
 def read_header(raw: bytes) -> PlyHeader:
     """Parse the header of a PLY file; raises MalformedFile naming the line."""
     lines, size = _lines(raw)
-    if lines[0].strip() != b"ply":
+    if lines[0].removeprefix(BOM).strip() != b"ply":
         raise MalformedFile(f"line 1 of a PLY file must be 'ply', not {shown(lines[0])}")
     encoding: str | None = None
     elements: dict[str, tuple[int, dict[str, PlyProperty]]] = {}
@@ -77,7 +78,7 @@ def read_header(raw: bytes) -> PlyHeader:
     for number, line in enumerate(lines[1:-1], start=2):
         words = line.split()
         keyword = words[0] if words else b""
-        if keyword in (b"comment", b"obj_info"):
+        if keyword in (b"comment", b"obj_info", b""):
             continue
         where = f"line {number} of the PLY header"
         texts = _decoded(words, where)
@@ -102,20 +103,24 @@ def _lines(raw: bytes) -> tuple[list[bytes], int]:
     """Split off the header, bounded in bytes before anything else looks at it; the last line is `end_header`."""
     begin = 0
     lines: list[bytes] = []
-    only_cr = raw[3:4] == b"\r" and raw[4:5] != b"\n"  # old Mac: a binary body may begin with the byte of LF
+    magic = len(b"ply") + (len(BOM) if raw.startswith(BOM) else 0)
+    only_cr = (
+        raw[magic : magic + 1] == b"\r" and raw[magic + 1 : magic + 2] != b"\n"
+    )  # old Mac: a binary body may begin with the byte of LF
     while True:
-        window = raw[begin : begin + MAX_LINE_BYTES + 2]
-        ends = [at for at in (window.find(b"\n") if not only_cr else -1, window.find(b"\r")) if at >= 0]
-        if not ends:
-            if len(window) > MAX_LINE_BYTES:
+        limit = begin + MAX_LINE_BYTES + 2
+        end = -1 if only_cr else raw.find(b"\n", begin, limit)
+        cr = raw.find(b"\r", begin, limit if end < 0 else end)
+        end = cr if cr >= 0 else end
+        if end < 0:
+            if len(raw) - begin > MAX_LINE_BYTES:
                 raise MalformedFile(
                     f"line {len(lines) + 1} of the PLY header has more than {MAX_LINE_BYTES} bytes, the limit"
                 )
             raise MalformedFile(f"the PLY header ends in line {len(lines) + 1}, before 'end_header'")
-        end = min(ends)
-        has_crlf = not only_cr and window[end : end + 2] == b"\r\n"
-        lines.append(window[:end])
-        begin += end + (2 if has_crlf else 1)
+        has_crlf = not only_cr and raw[end : end + 2] == b"\r\n"
+        lines.append(raw[begin:end])
+        begin = end + (2 if has_crlf else 1)
         if lines[-1].strip() == b"end_header":
             return lines, begin
         if begin > MAX_HEADER_BYTES:

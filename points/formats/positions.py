@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from straightpcf.points.errors import UnsupportedCloud
 
 __all__ = [
     "AXES",
+    "axes_among",
     "changes",
     "gathered",
     "moved",
@@ -24,20 +25,26 @@ __all__ = [
     "widened",
 ]
 
-AXES = "xyz"
+AXES = ("x", "y", "z")
+
+
+def axes_among(names: Collection[str]) -> tuple[str, ...]:
+    """Return what a file with fields of these `names` calls its axes: x y z, or X Y Z where it has those alone."""
+    capitals = tuple(axis.upper() for axis in AXES)
+    return capitals if set(capitals) <= {*names} and not {*AXES} & {*names} else AXES
 
 
 def changes(
-    cloud: PointCloud, xyz: npt.NDArray[np.float64]
+    cloud: PointCloud, xyz: npt.NDArray[np.float64], axes: tuple[str, ...]
 ) -> tuple[tuple[str, ...], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return what a file must hold in the place of what was read: the names of C columns, new (N, C), old (N, C).
 
-    xyz: (N, 3) as read. The columns are the axes, and the normals where the cloud has new ones.
+    xyz: (N, 3) as read. The columns are the axes, as the file calls them, and the normals where the cloud has new ones.
     """
     if cloud.normals is None:
-        return tuple(AXES), cloud.xyz, xyz
+        return axes, cloud.xyz, xyz
     new, old = np.hstack([cloud.xyz, cloud.normals]), np.hstack([xyz, cloud.old_normals()])
-    return (*AXES, *cloud.normal_names), new, old
+    return (*axes, *cloud.normal_names), new, old
 
 
 def moved(new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

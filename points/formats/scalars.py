@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.points.formats.positions import AXES
+
 __all__ = ["further_columns", "not_held", "scalar_columns"]
 
+_NAME_CHARACTERS = 64
 _WIDER = {"f2": "f4", "b1": "u1", "i8": "f8", "u8": "f8", "f16": "f8"}
 
 
@@ -21,8 +24,8 @@ def scalar_columns(
     """Return the numeric attributes as (N,) columns of the `types` (such as "f4") that a new file can hold.
 
     An (N, M) attribute becomes M columns; a type that is missing becomes the next that holds its numbers, or at least
-    their size (`not_held` says where); names
-    lose what a header cannot carry, and columns whose name is in `taken` or comes twice are numbered.
+    their size; names lose what a header cannot carry, and columns whose name is in `taken` or comes twice are numbered
+    (`not_held` says which).
     """
     columns: dict[str, npt.NDArray[Any]] = {}
     for name, values in attributes.items():
@@ -32,23 +35,31 @@ def scalar_columns(
         for index, part in enumerate(parts):
             kind = part.dtype.str[1:]
             wide = _held_as(kind, types)
-            label = _free(name if len(parts) == 1 else f"{name}_{index}", [*taken, *columns])
+            plain = _plain(name)
+            label = _free(plain if len(parts) == 1 else f"{plain}_{index}"[:_NAME_CHARACTERS], [*taken, *columns])
             columns[label] = part.astype("<" + wide)
     return columns
 
 
 def not_held(attributes: Mapping[str, npt.NDArray[Any]], types: Collection[str]) -> list[str]:
-    """Name the attributes that `scalar_columns` leaves out, or whose numbers no longer come out as they went in."""
-    lost = []
+    """Name the attributes that `scalar_columns` leaves out, or whose numbers or names come out as others."""
+    lost: list[str] = []
+    labels = [*AXES]
     for name, values in attributes.items():
-        kind = values.dtype.str[1:]
+        kind, changes = values.dtype.str[1:], []
         if values.dtype.kind not in "biuf":
             lost.append(name)
-        elif (wide := _held_as(kind, types)) != kind:
+            continue
+        labels.append(_free(_plain(name), labels))
+        if labels[-1] != name:
+            changes.append(f"renamed to {labels[-1]}")
+        if (wide := _held_as(kind, types)) != kind:
             with np.errstate(invalid="ignore"):  # of what is beyond the type, and differs
                 again = values.astype(wide).astype(values.dtype)
             if not np.array_equal(again, values, equal_nan=values.dtype.kind == "f"):
-                lost.append(f"{name} (rounded to {np.dtype(wide).name})")
+                changes.append(f"rounded to {np.dtype(wide).name}")
+        if changes:
+            lost.append(f"{name} ({', '.join(changes)})")
     return lost
 
 
@@ -61,8 +72,13 @@ def further_columns(rows: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
     return {f"column_{index + 1}": rows[:, index] for index in range(3, rows.shape[1])}
 
 
-def _free(name: str, used: Collection[str]) -> str:
-    label = re.sub(r"[^A-Za-z0-9_.\-]", "_", name)[:64] or "field"
+def _plain(name: str) -> str:
+    """Return a name as any header can carry it; PCD takes one of nothing but `_` for padding."""
+    plain = re.sub(r"[^A-Za-z0-9_.\-]", "_", name)[:_NAME_CHARACTERS]
+    return plain if plain.strip("_") else "field"
+
+
+def _free(label: str, used: Collection[str]) -> str:
     free, number = label, 2
     while free in used:
         free, number = f"{label}_{number}", number + 1

@@ -17,16 +17,28 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.positions import moved, number_text
 
-__all__ = ["Lines", "as_integers", "as_number", "as_numbers", "blocks", "refuse_binary", "replaced", "shown"]
+__all__ = [
+    "Lines",
+    "as_integers",
+    "as_number",
+    "as_numbers",
+    "blocks",
+    "is_missing",
+    "refuse_binary",
+    "replaced",
+    "shown",
+]
 
 BLOCK_BYTES = 1 << 23
 MAX_NUMBER_CHARACTERS = 400
+_STEP_TOKENS, _STEP_CHARACTERS = 1 << 16, 1 << 20  # read at once, each as wide as the longest of them
 _Offsets = npt.NDArray[np.int64]
 
 _IS_SPACE = np.zeros(256, bool)
-_IS_SPACE[list(b" \t\n\v\f\r")] = True
+_IS_SPACE[list(b" \t\n\v\f\r\x1a")] = True  # Ctrl-Z, how DOS ends a file
 _IN_NUMBER = np.zeros(256, bool)
-_IN_NUMBER[list(b"0123456789+-.eEnNaAiIfFtTyYdDqQsS#()\0")] = True
+_IN_NUMBER[list(b"0123456789+-.eEnNaAiIfFtTyYdDqQsSuUlL#()\0")] = True
+_MISSING = frozenset((b"", b"na", b"null"))  # what spreadsheets and databases write where there is no number
 # What Microsoft's C runtimes print, old and new: -1.#IND00, 1.#INF, -nan(ind).
 _NOT_FINITE = re.compile(rb"([+-]?)(?:1\.#(inf)0*|1\.#(?:ind|[qs]nan)0*|nan\((?:ind|snan)\))", re.IGNORECASE)
 
@@ -60,7 +72,8 @@ def blocks(
     """Yield the lines from byte `begin` on, block by block, each with the offset where the next block begins.
 
     Lines end in LF, CRLF or a lone CR.  Without a delimiter, tokens are runs of anything but white space; with one,
-    they are what stands between two delimiters, white space trimmed, and may be empty.  longest: bytes of a line that
+    they are what stands between two delimiters, white space and quotes trimmed, and may be empty: a line of delimiters
+    is no blank one. Quoted delimiters are text, in a line whose quotes come in pairs.  longest: bytes of a line that
     does not fit into a block; raises UnsupportedCloud before memory is taken for a longer one.
     """
     while begin < len(raw):
@@ -93,16 +106,28 @@ def _split(raw: bytes, begin: int, end: int, delimiter: bytes | None) -> Lines:
 
     in_token = ~_IS_SPACE[text]
     if delimiter is not None:
-        in_token &= text != delimiter[0]
+        is_mark, is_quote = text == delimiter[0], text == ord('"')
+        if is_quote.any():
+            is_mark &= ~_quoted(is_quote, line_starts)
+        in_token &= ~(is_mark | is_quote)
     edges = np.diff(in_token.view(np.int8), prepend=np.int8(0), append=np.int8(0))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     first, last = np.searchsorted(starts, line_starts), np.searchsorted(starts, line_ends)
     if delimiter is not None:
-        is_blank = first == last
-        marks = np.flatnonzero(text == delimiter[0])
+        marks = np.flatnonzero(is_mark)
+        is_blank = (first == last) & (np.searchsorted(marks, line_starts) == np.searchsorted(marks, line_ends))
         starts, ends, first, last = _fields(marks, line_starts, line_ends, starts, ends)
         last = np.where(is_blank, first, last)
     return Lines(raw, line_starts + begin, first, last - first, starts + begin, ends + begin)
+
+
+def _quoted(is_quote: npt.NDArray[np.bool_], line_starts: _Offsets) -> npt.NDArray[np.bool_]:
+    """Return (K,) bool: which bytes stand between two quotes of a line; none where a line has an odd number of them."""
+    counts = np.add.reduceat(is_quote, line_starts, dtype=np.int64)
+    lengths = np.diff(np.append(line_starts, len(is_quote)))
+    paired = is_quote & np.repeat(counts % 2 == 0, lengths)
+    inside: npt.NDArray[np.bool_] = np.logical_xor.accumulate(paired)
+    return inside
 
 
 def _fields(
@@ -121,11 +146,16 @@ def _fields(
     return token_starts, token_ends, first, np.searchsorted(field_starts, line_ends, side="right")
 
 
-def as_numbers(raw: bytes, starts: _Offsets, ends: _Offsets) -> tuple[npt.NDArray[np.float64], int | None]:
-    """Read (K,) tokens as float64; also return the index of the first that is no number, or None."""
+def as_numbers(
+    raw: bytes, starts: _Offsets, ends: _Offsets, *, may_miss: bool = False
+) -> tuple[npt.NDArray[np.float64], int | None]:
+    """Read (K,) tokens as float64; also return the index of the first that is no number, or None.
+
+    may_miss: an empty token, NA and null are NaN.
+    """
     values = np.full(len(starts), np.nan)
-    for begin, chunk in _texts(raw, starts, ends):
-        bad = _parse(chunk, values[begin : begin + len(chunk)])
+    for begin, chunk in _texts(raw, starts, ends, empty=b"nan" if may_miss else b"?"):
+        bad = _parse(chunk, values[begin : begin + len(chunk)], may_miss=may_miss)
         if bad is not None:
             return values, begin + bad
     return values, None
@@ -153,24 +183,34 @@ def as_integers(
     return np.array(exact, dtype), None
 
 
-def _texts(raw: bytes, starts: _Offsets, ends: _Offsets) -> Iterator[tuple[int, npt.NDArray[Any]]]:
-    """Yield (first index, (k,) fixed-width byte strings); a token that is too long for a number comes out as `?`."""
+def is_missing(token: bytes) -> bool:
+    """Say whether a cell of a delimited table has no number where its column has some."""
+    return token.lower() in _MISSING
+
+
+def _texts(raw: bytes, starts: _Offsets, ends: _Offsets, *, empty: bytes) -> Iterator[tuple[int, npt.NDArray[Any]]]:
+    """Yield (first index, (k,) fixed-width byte strings), `?` for a token that is too long for a number."""
     text = np.frombuffer(raw, np.uint8)
-    step = 1 << 16
-    for begin in range(0, len(starts), step):
-        at = starts[begin : begin + step]
-        length = ends[begin : begin + step] - at
-        length = np.where(length > MAX_NUMBER_CHARACTERS, 0, length)
-        width = max(int(length.max()), 1)
+    begin = 0
+    while begin < len(starts):
+        at = starts[begin : begin + _STEP_TOKENS]
+        length = ends[begin : begin + _STEP_TOKENS] - at
+        is_empty, is_long = length == 0, length > MAX_NUMBER_CHARACTERS
+        length = np.where(is_long, 0, length)
+        widths = np.maximum(np.maximum.accumulate(length), len(empty))
+        count = int(np.count_nonzero(widths * np.arange(1, len(at) + 1) <= _STEP_CHARACTERS))
+        at, length, width = at[:count], length[:count], int(widths[count - 1])
         column = np.arange(width)
         index = np.minimum(at[:, None] + column, max(len(text) - 1, 0))
         characters = np.where(column < length[:, None], text[index], 0).astype(np.uint8)
-        characters[length == 0, 0] = ord("?")
+        characters[is_empty[:count], : len(empty)] = list(empty)
+        characters[is_long[:count], 0] = ord("?")
         characters[~_IN_NUMBER[characters].all(axis=1), 0] = ord("?")
-        yield begin, characters.view(f"S{width}").reshape(len(at))
+        yield begin, characters.view(f"S{width}").reshape(count)
+        begin += count
 
 
-def _parse(texts: npt.NDArray[Any], out: npt.NDArray[np.float64]) -> int | None:
+def _parse(texts: npt.NDArray[Any], out: npt.NDArray[np.float64], *, may_miss: bool) -> int | None:
     try:
         out[:] = texts.astype(np.float64)
     except ValueError:
@@ -179,7 +219,7 @@ def _parse(texts: npt.NDArray[Any], out: npt.NDArray[np.float64]) -> int | None:
         return None
     for row, token in enumerate(texts.tolist()):
         try:
-            out[row] = as_number(token)
+            out[row] = np.nan if may_miss and is_missing(token) else as_number(token)
         except ValueError:
             return row
     return None

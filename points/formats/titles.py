@@ -13,6 +13,7 @@ from straightpcf.points.formats.text import shown
 __all__ = ["MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "words_of"]
 
 MAX_COLUMNS = 4096
+_AROUND = b'" \t\n\v\f\r'  # a cell between delimiters
 # Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
 _POSITIONS = (
     AXES,
@@ -20,6 +21,11 @@ _POSITIONS = (
     ("px", "py", "pz"),
     ("pos_x", "pos_y", "pos_z"),
     *(("easting", "northing", height) for height in ("elevation", "height", "altitude", "z")),
+    *(("east", "north", height) for height in ("elev", "elevation", "height", "z")),
+    ("e", "n", "z"),
+    *(tuple(axis + more for axis in AXES) for more in ("_m", " coordinate", "_coordinate", " coord", "_coord")),
+    ("x1", "y1", "z1"),  # Ouster's first returns
+    ("0", "1", "2"),  # pandas' numbers of columns
 )
 _UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
@@ -56,13 +62,25 @@ def named_columns(
 
 
 def delimiter_of(row: bytes) -> bytes | None:
-    """Return what a row has between its cells; None for white space."""
-    return next((mark for mark in (b";", b",") if mark in row), None)
+    """Return what a row has between its cells, quoted ones left out; None for white space."""
+    bare = b"".join(_by_quotes(row)[::2])
+    return next((mark for mark in (b";", b",") if mark in bare), None)
 
 
 def words_of(row: bytes, most: int = MAX_COLUMNS) -> list[bytes]:
-    """Split a row; what is beyond the limit stays together as one more word."""
-    return [word.strip() for word in row.split(delimiter_of(row), most)] if row else []
+    """Split a row, its quotes taken off; what is beyond the limit stays together as one more word."""
+    mark = delimiter_of(row)
+    if mark is None:
+        return row.split(None, most)
+    parts = _by_quotes(row)
+    parts[1::2] = [part.replace(mark, b"\0") for part in parts[1::2]]  # no text has a zero byte of its own
+    return [word.replace(b"\0", mark).strip(_AROUND) for word in b'"'.join(parts).split(mark, most)]
+
+
+def _by_quotes(row: bytes) -> list[bytes]:
+    """Split a row at its quotes: every second part is quoted; one part where they are not in pairs, or too many."""
+    count = row.count(b'"')
+    return row.split(b'"') if count % 2 == 0 and count <= 4 * MAX_COLUMNS else [row]
 
 
 def _meant(title: Title | None, columns: int) -> Iterator[list[str]]:
@@ -103,9 +121,13 @@ def _refuse(names: Title | None, line: int, columns: int, *, fits: bool) -> None
 
 
 def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:
-    """Return which of the columns so named are x, y and z, where each is named once."""
-    plain = [_UNIT.sub("", word.lower()) for word in words]
-    for x, y, z in _POSITIONS:
-        if plain.count(x) == plain.count(y) == plain.count(z) == 1:
-            return plain.index(x), plain.index(y), plain.index(z)
+    """Return which of the columns so named are x, y and z, where each is named once: so written, or in any case.
+
+    A table may have x and X; swapcase finds X, Y, Z beside an x.
+    """
+    plain = [_UNIT.sub("", word) for word in words]
+    for cased in (plain, [word.swapcase() for word in plain], [word.lower() for word in plain]):
+        for x, y, z in _POSITIONS:
+            if cased.count(x) == cased.count(y) == cased.count(z) == 1:
+                return cased.index(x), cased.index(y), cased.index(z)
     return None

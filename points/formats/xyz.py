@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,6 +24,7 @@ from straightpcf.points.formats.text import (
     as_number,
     as_numbers,
     blocks,
+    is_missing,
     refuse_binary,
     replaced,
     shown,
@@ -33,7 +34,9 @@ from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, 
 __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
+MAX_LINES_ABOVE = 100_000  # they are read one by one: a tenth of a second
 _COMMENTS = (b"#", b"//")
+_SEPARATOR = re.compile(rb'"?sep=.?"?', re.IGNORECASE)  # Excel's first line; the rows say it, too
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 _BOM = b"\xef\xbb\xbf"
 # What stands behind x, y, z in a .pts file of so many columns.
@@ -48,7 +51,8 @@ _Offsets = npt.NDArray[np.int64]
 class Layout:
     """Describe the table; begin, line: byte offset and line number of its first line.  axes: the columns of x, y, z.
 
-    declared: the number of points if a line of its own says it, as in `.pts`.  delimiter: None for white space.
+    declared: the number of points if a line of its own says it, as in `.pts`: those up to the next such line, of a
+    further scan.  delimiter: None for white space.
     """
 
     begin: int
@@ -79,12 +83,13 @@ class Xyz(Format):
 
     x, y, z are the columns that a line of names above the table says, and the first three where there is none
     (`titles`); names of more than three columns that say nothing of positions, or that are of more or fewer columns
-    than the table has, are refused. Comment lines (`#`, `//`), blank lines, a line
-    with the number of points and columns of any text are kept.
+    than the table has, are refused. Between commas or semicolons a cell that is empty, `NA` or `null` is NaN, and one
+    in quotes may hold them. Comment lines (`#`, `//`), blank lines, lines with the number of points and columns of any
+    text are kept.
     """
 
     name = "xyz"
-    suffixes: ClassVar[tuple[str, ...]] = (".xyz", ".txt", ".asc")
+    suffixes: ClassVar[tuple[str, ...]] = (".xyz", ".txt", ".asc", ".xyzn", ".xyzrgb", ".tsv")
     media_type = "text/plain"
     has_magic = False
     delimiter: ClassVar[bytes | None] = None  # of a new file; None for a space
@@ -102,14 +107,11 @@ class Xyz(Format):
         layout = _layout(raw)
         if layout.declared is not None:
             check_count(layout.declared, max_points, f"line {layout.line - 1}")
-        starts, ends, columns = _table(raw, layout, max_points)
-        if layout.declared not in (None, len(starts)):
-            raise MalformedFile(f"the file declares {layout.declared} points and holds {len(starts)}")
+        starts, ends, columns, texts = _table(raw, layout, max_points)
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
         attributes = {layout.names[column]: values for column, values in columns.items()}
-        texts = {*layout.names} - {*attributes} - {layout.names[axis] for axis in layout.axes}
         source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
-        return PointCloud(xyz, attributes, source, beside=tuple(name for name in layout.names if name in texts))
+        return PointCloud(xyz, attributes, source, beside=tuple(layout.names[column] for column in texts))
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name nothing where the table that was read has the layout."""
@@ -176,19 +178,28 @@ def _layout(raw: bytes) -> Layout:
     names: Title | None = None
     remarks: deque[Title] = deque(maxlen=_REMARKS)
     while at < len(raw):
-        found = _LINE_END.search(raw, at)
-        end = found.end() if found else len(raw)
-        text = raw[at:end].strip()
-        if text.startswith(_COMMENTS):
+        if line > MAX_LINES_ABOVE:
+            raise UnsupportedCloud(
+                f"no point is in the first {MAX_LINES_ABOVE} lines, the limit of what stands above them"
+            )
+        text, end = _line_at(raw, at)
+        if text.startswith(_COMMENTS) or _SEPARATOR.fullmatch(text):
             remarks.append(Title(line, text[:_REMARK_BYTES].lstrip(b"#/ ")))
         elif text and declared is None and names is None and text.isdigit() and len(text) <= 18:
             declared = int(text)
-        elif text and names is None and _are_names(words_of(text)):
+        elif text and names is None and (_are_names(text) or _are_numbered(text, _line_at(raw, end)[0])):
             names = Title(line, text.lstrip(b"% "))  # MATLAB's comments
         elif text:
             return _described(at, line, declared, text, names, remarks)
         at, line = end, line + 1
     return Layout(len(raw), line, declared, None, ("x", "y", "z"), (0, 1, 2))
+
+
+def _line_at(raw: bytes, begin: int) -> tuple[bytes, int]:
+    """Return the line at byte `begin` without the white space around it, and where the next one begins."""
+    found = _LINE_END.search(raw, begin)
+    end = found.end() if found else len(raw)
+    return raw[begin:end].strip(), end
 
 
 def _described(
@@ -205,8 +216,23 @@ def _described(
     return Layout(begin, line, declared, delimiter_of(row), labels, axes)
 
 
-def _are_names(words: Sequence[bytes]) -> bool:
-    return len(words) >= 3 and not any(_is_number(word) for word in words)
+def _are_names(text: bytes) -> bool:
+    words = words_of(text)
+    has_gaps = delimiter_of(text) is not None and all(is_missing(word) for word in words)
+    return len(words) >= 3 and not has_gaps and not any(_is_number(word) for word in words)
+
+
+def _are_numbered(text: bytes, following: bytes) -> bool:
+    """Say whether a line is pandas' 0, 1, 2... above columns without names; the line after it tells it from a point.
+
+    Before them may stand the empty name of an index.
+    """
+    words = words_of(text)
+    lead = int(words[0] == b"")
+    if len(words) < lead + 3 or words[lead:] != [b"%d" % column for column in range(len(words) - lead)]:
+        return False
+    row = words_of(following)
+    return len(row) == len(words) and not any(word.lstrip(b"+-").isdigit() for word in row[lead : lead + 3])
 
 
 def _is_number(word: bytes) -> bool:
@@ -217,33 +243,61 @@ def _is_number(word: bytes) -> bool:
     return True
 
 
-def _table(raw: bytes, layout: Layout, max_points: int) -> tuple[_Offsets, _Offsets, dict[int, npt.NDArray[Any]]]:
-    """Return the (N, 3) starts and ends of the position tokens, and every column that holds only numbers."""
+def _table(
+    raw: bytes, layout: Layout, max_points: int
+) -> tuple[_Offsets, _Offsets, dict[int, npt.NDArray[Any]], list[int]]:
+    """Return the (N, 3) starts and ends of the position tokens, every column of numbers, and which are of text.
+
+    A column without a name and with nothing in it is what a delimiter at the end of every line makes: none.
+    """
     starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
     parts: dict[int, list[npt.NDArray[Any]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
-    line, count = layout.line, 0
+    line, count, may_miss, declared = layout.line, 0, layout.delimiter is not None, layout.declared
+    texts, unsaid = [], {column for column, name in enumerate(layout.names) if name == f"column_{column + 1}"}
     for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter, longest=MAX_LINE_BYTES):
-        rows = np.flatnonzero(_is_row(lines))
+        is_row = _is_row(lines)
+        if declared is not None:
+            further = np.flatnonzero(is_row & (lines.counts == 1))
+            is_row[further] = False
+            declared += _scans(lines.pick(further), line + further)
+        rows = np.flatnonzero(is_row)
         table, numbers = lines.pick(rows), line + rows
         line, count = line + len(lines), count + len(rows)
         check_count(count, max_points, "the file")
         _check_columns(table, numbers, len(layout.names))
         for column in list(parts):
             token = table.first + column
-            values, bad = as_numbers(raw, table.starts[token], table.ends[token])
+            begins, stops = table.starts[token], table.ends[token]
+            if column in unsaid and (begins < stops).any():
+                unsaid.remove(column)
+            values, bad = as_numbers(raw, begins, stops, may_miss=may_miss)
             if bad is None:
                 has_ids = column not in layout.axes and _is_beyond_doubles(values)
                 parts[column].append(_whole(table, token, values) if has_ids else values)
             elif column in layout.axes:
-                text = raw[table.starts[token[bad]] : table.ends[token[bad]]]
+                text = raw[begins[bad] : stops[bad]]
                 raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number")
             else:
-                del parts[column]  # a column of text: it stays in the file
+                texts.append(column)  # it stays in the file
+                del parts[column]
         tokens = table.first[:, None] + np.array(layout.axes)
         starts.append(table.starts[tokens])
         ends.append(table.ends[tokens])
-    columns = {column: _joined(values) for column, values in parts.items()}
-    return np.concatenate(starts), np.concatenate(ends), columns
+    if declared not in (None, count):
+        raise MalformedFile(f"the file declares {declared} points and holds {count}")
+    there = {*layout.axes} | ({*parts} - unsaid)
+    columns = {column: _joined(values) for column, values in parts.items() if column in there}
+    return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
+
+
+def _scans(lines: Lines, numbers: npt.NDArray[np.int64]) -> int:
+    """Add up the numbers of points, each a line of its own, of further scans below a first."""
+    counts, bad = as_integers(lines.raw, lines.starts[lines.first], lines.ends[lines.first], np.dtype(np.int32))
+    if bad is not None or (counts < 0).any():
+        row = int(np.argmin(counts)) if bad is None else bad
+        token = lines.raw[lines.starts[lines.first[row]] : lines.ends[lines.first[row]]]
+        raise MalformedFile(f"line {numbers[row]} has 1 column, neither a point nor a number of them: {shown(token)}")
+    return int(counts.sum(dtype=np.int64))
 
 
 def _is_beyond_doubles(values: npt.NDArray[np.float64]) -> bool:
@@ -277,7 +331,8 @@ def _is_row(lines: Lines) -> npt.NDArray[np.bool_]:
     text = np.frombuffer(lines.raw, np.uint8)
     at = lines.starts[lines.first[is_row]]
     following = text[np.minimum(at + 1, len(text) - 1)]
-    is_row[is_row] = (text[at] != ord("#")) & ~((text[at] == ord("/")) & (following == ord("/")))
+    is_remark = (text[at] == ord("#")) | ((text[at] == ord("/")) & (following == ord("/")))
+    is_row[is_row] = ~is_remark | (text[at - 1] == ord('"'))  # a quoted cell may begin with anything
     return is_row
 
 

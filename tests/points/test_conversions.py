@@ -60,6 +60,22 @@ def test_whole_numbers_of_64_bits_arrive_as_they_are_or_are_named(target: str, i
     np.testing.assert_array_equal(again["id"], np.arange(3))
 
 
+@pytest.mark.parametrize("target", ["ply", "pcd", "las", "csv", "xyz"])
+def test_names_that_no_header_carries_become_others_and_are_named(target: str, tmp_path: Path) -> None:
+    names = ["\u5f37\u5ea6", "__", "scan id", "field", "label"]
+    cloud = PointCloud(torus(3), {name: np.arange(3, dtype=np.uint8) + index for index, name in enumerate(names)})
+    said = [
+        "\u5f37\u5ea6 (renamed to field)",
+        "__ (renamed to field_2)",
+        "scan id (renamed to scan_id)",
+        "field (renamed to field_3)",
+    ]
+    assert format_named(target).left_behind(cloud) == said
+    again = converted(cloud, target, tmp_path).attributes
+    for index, name in enumerate(["field", "field_2", "scan_id", "field_3", "label"]):
+        np.testing.assert_array_equal(again[name], np.arange(3) + index)
+
+
 def test_columns_of_text_faces_and_records_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x,y,z,kind,w\n1,2,3,tree,7\n")
     table = read_cloud(tmp_path / "a.csv")[0]

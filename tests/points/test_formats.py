@@ -45,6 +45,11 @@ def test_a_cloud_that_did_not_move_comes_back_byte_for_byte(sample: Path) -> Non
     assert rewritten(cloud.with_xyz(cloud.xyz.copy()), format, sample).read_bytes() == sample.read_bytes()
 
 
+def test_a_format_checks_its_own_clouds_and_takes_them(sample: Path) -> None:
+    cloud, format = read_cloud(sample)
+    format.check(cloud)
+
+
 def test_moved_points_come_back_where_they_were_put_with_everything_else_kept(sample: Path) -> None:
     cloud, format = read_cloud(sample)
     moved = cloud.xyz + np.random.default_rng(0).normal(0, 0.1, cloud.xyz.shape)

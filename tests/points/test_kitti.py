@@ -20,7 +20,7 @@ def frame(tmp_path: Path) -> Path:
     rows = np.empty((N, 4), "<f4")
     rows[:, :3], rows[:, 3] = torus(N), np.linspace(0, 1, N)
     bits = rows.view("<u4")
-    bits[3, 0], bits[4, 1], bits[5, 3] = 0x7F800001, 0xFFC12345, 0x7FA00000  # NaN of three kinds, one in the intensity
+    bits[3, 0], bits[4, 1], bits[5, 2] = 0x7F800001, 0xFFC12345, 0x7FA00000  # NaN of three kinds
     rows[6, 2] = -0.0
     (path := tmp_path / "000000.bin").write_bytes(rows.tobytes())
     return path
@@ -80,3 +80,23 @@ def test_what_float32_would_blur_is_refused_as_a_frame(frame: Path) -> None:
     town = foreign.with_xyz(foreign.xyz * 100 + [691_000.0, 5_334_000.0, 520.0])
     with pytest.raises(UnsupportedCloud, match=r"rounded to float32.* up to 0\.25 off.*: take another format"):
         write_cloud(town, out, format)
+
+
+@pytest.mark.parametrize("columns", [3, 5, 6])
+def test_rows_of_other_than_four_numbers_are_refused_saying_what_is_expected(columns: int, tmp_path: Path) -> None:
+    rows = np.zeros((N, columns), "<f4")
+    rows[:, :3] = torus(N)
+    (path := tmp_path / "cloud.bin").write_bytes(rows.tobytes())
+    with pytest.raises(UnsupportedCloud, match=r"four float32 a point.* the fourth of point \d+ is -.*\.npy"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(("value", "is_one"), [(0.5, True), (255, True), (-0.5, False), (np.nan, False)])
+def test_an_intensity_that_no_frame_has_is_left_behind(value: float, is_one: bool, frame: Path) -> None:
+    cloud, format = read_cloud(frame)
+    values = np.full(N, 0.25)
+    values[7] = value
+    foreign = replace(cloud, source=None, attributes={"intensity": values})
+    assert format.left_behind(foreign) == ([] if is_one else ["intensity"])
+    write_cloud(foreign, out := frame.with_name("out.bin"), format)
+    np.testing.assert_array_equal(read_cloud(out)[0].attributes["intensity"], values if is_one else np.zeros(N))

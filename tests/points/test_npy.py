@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import tracemalloc
 import zipfile
@@ -48,6 +49,35 @@ def test_type_shape_and_memory_order_are_kept(shape: tuple[int, int], dtype: str
     np.testing.assert_array_equal(after[:, 3:], array[:, 3:])
 
 
+@pytest.mark.parametrize("suffix", ["npy", "npz"])
+@pytest.mark.parametrize("axes", ["xyz", "XYZ"])
+def test_records_are_read_by_their_fields_and_only_positions_change(axes: str, suffix: str, tmp_path: Path) -> None:
+    kinds = [
+        ("X_ORIG", "u1"),
+        (axes[2], "<f8"),
+        (axes[0], ">f4"),
+        ("rgb", "u1", (3,)),
+        (axes[1], "<f4"),
+        ("at", [("t", "f8")]),
+    ]
+    array = np.zeros(6, kinds)
+    array["X_ORIG"], array["rgb"], array["at"]["t"] = np.arange(6), np.arange(18).reshape(6, 3), 7.5
+    for name, column in zip(axes, torus(6).T, strict=True):
+        array[name] = column
+    raw = npy(array) if suffix == "npy" else npz(cloud=array, label=np.arange(6))
+    cloud = read(tmp_path, raw)
+    np.testing.assert_allclose(cloud.xyz, torus(6), atol=1e-6)
+    np.testing.assert_array_equal(cloud.attributes["rgb"], array["rgb"])
+    assert [*cloud.attributes][:2] == ["X_ORIG", "rgb"]
+    assert cloud.beside == ("at",)
+    assert written(tmp_path, cloud, suffix) == raw
+    after = np.load(io.BytesIO(written(tmp_path, cloud.with_xyz(cloud.xyz + 1), suffix)))
+    after = after if suffix == "npy" else after["cloud"]
+    assert after.dtype == array.dtype
+    for name in array.dtype.names or ():
+        np.testing.assert_array_equal(after[name], array[name] + 1 if name in axes else array[name])
+
+
 def test_a_shape_as_python_2_wrote_it_is_read(tmp_path: Path) -> None:
     raw = npy(torus(5)).replace(b"(5, 3)", b"(5L, 3L)").replace(b"}  ", b"}", 1)
     assert len(raw) == len(npy(torus(5)))
@@ -59,7 +89,7 @@ def test_bytes_after_the_array_are_kept(tmp_path: Path) -> None:
     assert written(tmp_path, read(tmp_path, raw), "npy") == raw
 
 
-@pytest.mark.parametrize("key", ["points", "xyz", "pos", "anything"])
+@pytest.mark.parametrize("key", ["points", "xyz", "pos", "coord", "coords", "vertices", "positions", "anything"])
 def test_npz_positions_are_found_and_other_arrays_kept(key: str, tmp_path: Path) -> None:
     others = {"label": np.arange(6), "scale": np.array(2.5), "objects": np.array([{}, None], dtype=object)}
     if key != "anything":
@@ -74,6 +104,30 @@ def test_npz_positions_are_found_and_other_arrays_kept(key: str, tmp_path: Path)
     np.testing.assert_array_equal(after[key], (torus(6).astype(np.float32) + 1.0).astype(np.float32))
     for name, values in others.items():
         np.testing.assert_array_equal(after[name], values)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"points": np.float64(3)},
+        {"points": np.arange(6), "xyz": np.zeros((6, 2))},
+        {"normals": np.ones((6, 3)), "Normal": np.ones((6, 3)), "colors": np.ones((6, 3)), "colour": np.ones((6, 4))},
+    ],
+)
+def test_npz_arrays_that_are_no_positions_are_passed_over(others: dict[str, Any], tmp_path: Path) -> None:
+    raw = npz(**others, cloud=torus(6))
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, torus(6))
+    assert written(tmp_path, cloud, "npz") == raw
+
+
+def test_an_array_of_another_format_called_as_positions_are_is_an_attribute(tmp_path: Path) -> None:
+    cloud = PointCloud(torus(6), {"xyz": np.ones((6, 3)), "coord": np.arange(6)})
+    (tmp_path / "body").write_bytes(written(tmp_path, cloud, "npz"))
+    again = read_cloud(tmp_path / "body")[0]
+    assert format_named("npz").left_behind(cloud) == []
+    np.testing.assert_array_equal(again.xyz, cloud.xyz)
+    assert list(again.attributes) == ["xyz", "coord"]
 
 
 def test_a_new_npz_is_the_same_every_time_and_has_every_attribute(tmp_path: Path) -> None:
@@ -101,6 +155,19 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "integers": (npy(np.zeros((5, 3), int)), UnsupportedCloud, "i8"),
     "complex": (npy(np.zeros((5, 3), complex)), UnsupportedCloud, "c16"),
     "long double": (npy(np.zeros((5, 3), np.longdouble)), UnsupportedCloud, "f16"),
+    "records of objects": (
+        npy(np.zeros(5, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("O", "O")])),
+        UnsupportedCloud,
+        "never unpickled",
+    ),
+    "records with whole numbers": (npy(np.zeros(5, [("x", "i4"), ("y", "i4"), ("z", "i4")])), UnsupportedCloud, "i4"),
+    "records in rows": (npy(np.zeros((5, 3), [("x", "f4"), ("y", "f4"), ("z", "f4")])), UnsupportedCloud, r"\(5, 3\)"),
+    "records without an x": (
+        npy(np.zeros(5, [("X_ORIG", "f8"), ("y", "f4")])),
+        UnsupportedCloud,
+        "records with such x, y, z",
+    ),
+    "records of no type": (_declaring("(5,)", "[('x', 'f4'), ('y', 'hello'), 3]"), UnsupportedCloud, "hello"),
     "structured": (npy(np.zeros(5, [("x", "f4"), ("y", "f4")])), UnsupportedCloud, "x"),
     "two columns": (npy(np.zeros((5, 2))), UnsupportedCloud, r"\(5, 2\)"),
     "three dimensions": (npy(np.zeros((5, 3, 3))), UnsupportedCloud, r"\(5, 3, 3\)"),
@@ -121,6 +188,7 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "damaged zip": (_altered(npz(points=torus(50))), MalformedFile, "NPZ"),
     "no arrays": (npz(), UnsupportedCloud, "no arrays"),
     "no positions": (npz(label=np.arange(5)), UnsupportedCloud, "label"),
+    "normals alone": (npz(normals=np.ones((5, 3))), UnsupportedCloud, "0 arrays.*normals"),
     "two candidates": (npz(a=np.zeros((5, 3)), b=np.zeros((5, 3))), UnsupportedCloud, "2 arrays.*a, b"),
     "object positions": (npz(points=np.array([{}, None], dtype=object)), UnsupportedCloud, "never unpickled"),
 }
@@ -199,3 +267,13 @@ def test_arrays_far_beyond_the_points_stay_packed_and_are_kept(
     write_cloud(cloud.with_xyz(cloud.xyz + 1), after := tmp_path / "b.npz", npz_format)
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(after) as new:
         assert [(m.filename, m.CRC) for m in old.infolist()[1:]] == [(m.filename, m.CRC) for m in new.infolist()[1:]]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize("count", [5, 20_000])
+def test_a_full_disk_is_the_disks_fault_not_the_archives(count: int, method: int, tmp_path: Path) -> None:
+    cloud = read(tmp_path, npz(method, points=torus(count), label=np.arange(count)))
+    with pytest.raises(OSError, match="space") as refused:
+        write_cloud(cloud.with_xyz(cloud.xyz + 1), Path("/dev/full"), format_named("npz"))
+    assert refused.value.errno == errno.ENOSPC

@@ -68,6 +68,86 @@ def test_old_files_have_columns_of_float32_and_a_number_of_points(tmp_path: Path
             _read(tmp_path, raw.replace(b"POINTS", wrong + b"\nPOINTS"))
 
 
+ROWS = b"1 2 3 7\n4 5 6 8\n7 8 9 9\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "beside"),
+    [
+        (b"", b"", ()),
+        (b"WIDTH 3\nHEIGHT 1", b"WIDTH 1\nHEIGHT 3", ("organised shape 1 x 3",)),
+        (b"0 0 0 1 0 0 0", b"0.0 -0 0 1.000 0 0 0e0", ()),
+        (b"0 0 0 1 0 0 0", b"1 2.5 3 1 0 0 0", ("viewpoint 1 2.5 3 1 0 0 0",)),
+        (b"0 0 0 1 0 0 0", b"0 0 0 0.5 0.5 0.5 0.5", ("viewpoint 0 0 0 0.5 0.5 0.5 0.5",)),
+        (b"HEIGHT 1", b"HEIGHT 1\nCOORDINATE left handed", ("header line COORDINATE",)),
+    ],
+)
+@pytest.mark.parametrize("encoding", [b"ascii", b"binary"])
+def test_what_the_header_says_beside_its_fields_is_named_where_it_is_left_behind(
+    old: bytes, new: bytes, beside: tuple[str, ...], encoding: bytes, tmp_path: Path
+) -> None:
+    body = ROWS if encoding == b"ascii" else b"".join(struct.pack("<3fI", *row) for row in np.arange(12).reshape(3, 4))
+    raw = HEADER.replace(old, new).replace(b"DATA ascii", b"DATA " + encoding) + body
+    cloud = _read(tmp_path, raw)
+    assert format_named("ply").left_behind(cloud) == list(beside)
+    moved = _written(tmp_path, cloud.with_xyz(cloud.xyz + 1))
+    assert moved.startswith(raw[: -len(body)])
+    assert _written(tmp_path, _read(tmp_path, moved).with_xyz(cloud.xyz + 1)) == moved
+
+
+@pytest.mark.parametrize("keyword", [b"COUNTS", b"count", b"Size"])
+def test_a_keyword_that_is_nearly_known_is_not_passed_over(keyword: bytes, tmp_path: Path) -> None:
+    known = keyword.upper().rstrip(b"S")
+    with pytest.raises(MalformedFile, match=rf"is unknown.*{keyword.decode()}"):
+        _read(tmp_path, HEADER.replace(b"\n" + known, b"\n" + keyword) + ROWS)
+
+
+def test_letters_of_types_may_be_small(tmp_path: Path) -> None:
+    raw = HEADER.replace(b"TYPE F F F U", b"TYPE f f f u") + ROWS
+    cloud = _read(tmp_path, raw)
+    assert cloud.attributes["label"].dtype == np.uint32
+    assert _written(tmp_path, cloud) == raw
+
+
+@pytest.mark.parametrize("encoding", [b"ascii", b"binary"])
+def test_axes_may_be_capitals(encoding: bytes, tmp_path: Path) -> None:
+    body = ROWS if encoding == b"ascii" else np.arange(12, dtype="<f4").tobytes()
+    raw = HEADER.replace(b"x y z label", b"X Y Z w").replace(b"F F F U", b"F F F F")
+    raw = raw.replace(b"DATA ascii", b"DATA " + encoding) + body
+    cloud = _read(tmp_path, raw)
+    assert list(cloud.attributes) == ["w"]
+    again = _read(tmp_path, _written(tmp_path, cloud.with_xyz(cloud.xyz + 1)))
+    np.testing.assert_array_equal(again.xyz, cloud.xyz + 1)
+    assert _written(tmp_path, again.with_xyz(cloud.xyz)).startswith(raw[: -len(body)])
+    with pytest.raises(MalformedFile, match="there is no y"):
+        _read(tmp_path, raw.replace(b"X Y Z", b"x Y Z"))
+
+
+GREEN_AS_FLOAT = repr(float(np.array([0xFF00], "<u4").view("<f4")[0])).encode()
+
+
+@pytest.mark.parametrize(
+    ("kind", "texts", "expected"),
+    [
+        (b"I", (b"4278255360", b"16711680", b"255"), [[0, 255, 0], [255, 0, 0], [0, 0, 255]]),
+        (b"F", (GREEN_AS_FLOAT, b"nan", b"-nan"), [[0, 255, 0], [0, 0, 0], [0, 0, 0]]),
+    ],
+)
+def test_packed_colours_of_text_survive_a_conversion(
+    kind: bytes, texts: tuple[bytes, ...], expected: list[list[int]], tmp_path: Path
+) -> None:
+    rows = b"".join(b"%d 0 0 %s\n" % (row, text) for row, text in enumerate(texts))
+    raw = HEADER.replace(b"label", b"rgb").replace(b"TYPE F F F U", b"TYPE F F F " + kind) + rows
+    cloud = _read(tmp_path, raw)
+    assert cloud.attributes["rgb"].dtype.itemsize == 4
+    assert _written(tmp_path, cloud) == raw
+    write_cloud(cloud, out := tmp_path / "a.ply", format_named("ply"))
+    found = read_cloud(out)[0].attributes
+    colours = np.stack([found[name] for name in ("red", "green", "blue")], axis=1).tolist()
+    assert colours == expected
+    assert ("alpha" in found) is (kind == b"I")
+
+
 @pytest.mark.parametrize(
     ("body", "message"),
     [

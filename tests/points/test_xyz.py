@@ -45,6 +45,16 @@ TABLES = {
     "names behind a word": b"# columns: id x y z\n7 1 2 3\n8 4 5 6\n",
     "names between tabs": b"Point Id\tX\tY\tZ\n7\t1\t2\t3\n8\t4\t5\t6\n",
     "names with units between spaces": b"id x [m] y [m] z [m]\n7 1 2 3\n8 4 5 6\n",
+    "x beside X": b"X,x,Y,y,Z,z\n7,1,8,2,9,3\n7,4,8,5,9,6\n",
+    "X beside an x": b"x,X,Y,Z\n7,1,2,3\n7,4,5,6\n",
+    "E, N, Z": b"N,E,Z,I\n2,1,3,7\n5,4,6,7\n",
+    "East, North, Elev": b"id,EAST,NORTH,ELEV\n7,1,2,3\n7,4,5,6\n",
+    "Easting, Northing, Elevation": b"id,Easting,Northing,ELEVATION\n7,1,2,3\n7,4,5,6\n",
+    "coordinates": b"id,X Coordinate,Y Coordinate,Z Coordinate\n7,1,2,3\n7,4,5,6\n",
+    "names with a unit behind": b"t_s,x_m,y_m,z_m\n7,1,2,3\n7,4,5,6\n",
+    "Ouster's names": b"RANGE (mm),X1 (mm),Y1 (mm),Z1 (mm)\n7,1,2,3\n7,4,5,6\n",
+    "pandas' numbers": b"0,1,2\n1.0,2.0,3.0\n4.0,5,6.0\n",
+    "pandas' numbers and index": b",0,1,2,3\r\n0,1.0,2.0,3.0,7\r\n1,4.0,5,6.0,7\r\n",
     "MATLAB's comment": b"%id x y z\n7 1 2 3\n8 4 5 6\n",
     "names that begin with digits": b"1st,x,y,z\n7,1,2,3\n8,4,5,6\n",
     "a delimiter behind the cells": b"id,x,y,z\n7,1,2,3,\n8,4,5,6,\n",
@@ -55,6 +65,18 @@ TABLES = {
     "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
     "count": b"2\n1 2 3 -100 255 255 255\n4 5 6 -100 0 0 0\n",
     "count under a comment": b"# pts\n 2 \n1 2 3\n4 5 6\n",
+    "scans one below another": b"1\r\n1 2 3 -100 255 255 255\r\n# two\r\n 1\r\n4 5 6 -100 0 0 0\r\n0\r\n",
+    "Excel's first line": b"sep=;\r\nX;Y;Z\r\n1;2;3\r\n4;5;6\r\n",
+    "Ctrl-Z": b"1 2 3\r\n4 5 6\r\n\x1a",
+    "Ctrl-Z between commas": b"1,2,3\r\n4,5,6\r\n\x1a\r\n",
+    "a quoted comma": b'x,y,z,kind\n1,2,3,"an oak, old"\n4,5,6,"elm; young"\n',
+    "a quoted comma in the first row": b'1,2,3,"an oak, old; tall"\n4,5,6,\n',
+    "a quoted name with a comma": b'"id, n",x,y,z\r\n7,1,2,3\r\n8,4,5,6\r\n',
+    "quoted numbers": b'"x","y","z"\n"1","2","3"\n"4","5","6"\n',
+    "quoted numbers without names": b'"1";"2";"3"\n"4";"5";"6"\n',
+    "one quote in a line": b'1,2,3,5" thick\n4,5,6,7" thick\n',
+    "quotes in quotes": b'1,2,3,"an ""oak"", old"\n4,5,6,\n',
+    "a quoted number sign": b'k,x,y,z\n"#1",1,2,3\n"//",4,5,6\n',
     "words": b"1 2 3 tree 7\n4 5 6 house 8\n",
     "text that is no UTF-8": b"# \xe9\n1 2 3 \xff\n4 5 6 \xfe\n",
 }
@@ -100,6 +122,23 @@ def test_titles_as_programs_write_them_say_where_positions_are(raw: bytes, names
     assert written(tmp_path, cloud) == raw
 
 
+@pytest.mark.parametrize(
+    "raw",
+    [b"0 1 2\n4 5 6\n", b"0,1,2\n4.5,5,6.5\n", b"0,1,2.0\n4.5,5.5,6.5\n", b"0,2,1\n.5,.5,.5\n", b"0 1 2\n"],
+)
+def test_a_first_point_of_small_whole_numbers_is_a_point(raw: bytes, tmp_path: Path) -> None:
+    first = [float(word) for word in raw.replace(b",", b" ").split()[:3]]
+    assert read(tmp_path, raw).xyz[0].tolist() == first
+
+
+def test_a_table_with_two_cases_of_x_that_we_wrote_is_read_again(tmp_path: Path) -> None:
+    cloud = PointCloud(torus(3), {"X": np.arange(3), "id": np.arange(3)})
+    for name in ("out.csv", "out.xyz"):
+        again = read(tmp_path, written(tmp_path, cloud, name), name)
+        np.testing.assert_array_equal(again.xyz, cloud.xyz)
+        assert list(again.attributes) == ["X", "id"]
+
+
 @pytest.mark.parametrize("remark", [b"// X Y Z", b"# Coordinates x y z in UTM 32", b"# id x y z of a scan in May"])
 def test_a_remark_that_is_no_title_of_the_table_changes_nothing(remark: bytes, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path, remark + b"\n1 2 3 4 5 6\n").xyz, [[1, 2, 3]])
@@ -136,6 +175,38 @@ def test_what_microsofts_runtimes_print_is_no_number_but_no_name_either(token: b
 def test_what_only_looks_like_it_is_refused(token: bytes, tmp_path: Path) -> None:
     with pytest.raises(MalformedFile, match="no number"):
         read(tmp_path, b"1 2 3\n4 5 " + token + b"\n")
+
+
+@pytest.mark.parametrize("nothing", [b"", b"NA", b"null", b"NULL", b"nan", b"NaN", b" "])
+@pytest.mark.parametrize("above", [b"", b"x,y,z,w,kind\n"])
+def test_a_cell_with_nothing_in_it_is_nan_and_stays_as_it_is(above: bytes, nothing: bytes, tmp_path: Path) -> None:
+    raw = above + b"1,2,3,%b,oak\n%b,2,3,5,%b\n7,8,9,6,elm\n" % (nothing, nothing, nothing)
+    cloud = read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [np.nan, 2, 3], [7, 8, 9]])
+    np.testing.assert_array_equal(next(iter(cloud.attributes.values())), [np.nan, 5, 6])
+    assert (*cloud.attributes, *cloud.beside) == (("w", "kind") if above else ("column_4", "column_5"))
+    assert written(tmp_path, cloud) == raw
+    moved = cloud.xyz + np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]])
+    assert written(tmp_path, cloud.with_xyz(moved)) == raw.replace(b"7,8,", b"7,8.5,")
+
+
+@pytest.mark.parametrize("above", [b"", b"x,y,z\n"])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_a_line_of_delimiters_alone_is_a_point_that_is_missing(above: bytes, end: bytes, tmp_path: Path) -> None:
+    for rows in (b"1,2,3\n,,\n\n4,5,6\n", b",,\n1,2,3\n4,5,6\n", b"1,2,3\n4,5,6\n , ,", b"NA,NA,NA\n1,2,3\n4,5,6"):
+        raw = (above + rows).replace(b"\n", end)
+        cloud = read(tmp_path, raw)
+        assert len(cloud) == 3
+        np.testing.assert_array_equal(cloud.xyz[np.isfinite(cloud.xyz).all(axis=1)], [[1, 2, 3], [4, 5, 6]])
+        assert written(tmp_path, cloud) == raw
+
+
+@pytest.mark.parametrize("above", [b"", b"x;y;z\n", b"x;y;z;\n"])
+def test_a_delimiter_behind_every_row_makes_no_column(above: bytes, tmp_path: Path) -> None:
+    cloud = read(tmp_path, above + b"1;2;3;\n2;3;4;\n")
+    assert (dict(cloud.attributes), cloud.beside) == ({}, ())
+    assert read(tmp_path, b"x;y;z;w\n1;2;3;\n").attributes.keys() == {"w"}
+    assert read(tmp_path, above + b"1;2;3;\n2;3;4;oak\n").beside == ("column_4",)
 
 
 def test_nan_and_infinite_positions_are_read_and_kept(tmp_path: Path) -> None:
@@ -187,13 +258,17 @@ MALFORMED = {
     "a name among numbers": (b"x y z\n1 2 3\n1 z 3\n", r"line 3, column 2.*z"),
     "underscores": (b"1 2 1_000\n", r"line 1, column 3.*1_000"),
     "a very long token": (b"1 2 3\n1 2 " + b"1" * 5000 + b"\n", r"line 2, column 3"),
-    "an empty cell": (b"1,2,3\n1,,3\n", r"line 2, column 2"),
+    "no number between spaces": (b"1 2 3\n1 NA 3\n", r"line 2, column 2.*NA"),
     "more columns": (b"1 2 3\n\n1 2 3 4\n", r"line 3 has 4 columns.* 3"),
     "fewer columns": (b"# a\n1 2 3\n1 2\n", r"line 3 has 2 columns.* 3"),
     "two columns": (b"1 2\n3 4\n", r"line 1 has 2 columns"),
     "prose": (b"hello world\n", r"line 1 has 2 columns"),
     "count too high": (b"3\n1 2 3\n4 5 6\n", r"declares 3 .* holds 2"),
     "count too low": (b"1\n1 2 3\n4 5 6\n", r"declares 1 .* holds 2"),
+    "further count too high": (b"1\n1 2 3\n3\n4 5 6\n4 5 6\n", r"declares 4 .* holds 3"),
+    "no further count": (b"1\n1 2 3\n\n-3\n4 5 6\n", r"line 4 has 1 column.*-3"),
+    "no further count either": (b"1\n1 2 3\n3\nscan\n4 5 6\n", r"line 4 has 1 column.*scan"),
+    "a count below no count": (b"1 2 3\n1\n4 5 6\n", r"line 2 has 1 columns"),
     "names that name no position": (
         b"id,lon,lat,h\n1,2,3,4\n",
         r"names above line 2 .*id,lon,lat,h.*easting, northing",
@@ -204,7 +279,6 @@ MALFORMED = {
     ),  # R's row numbers
     "more names than columns": (b"a b id x y z\n1 2 3 4\n", r"line 1 names 6 or more columns.*line 2 has 4"),
     "a cell less than names": (b"id\tcode\tx\ty\tz\n1\t\t2\t3\t4\n", r"line 1 names 5 .*line 2 has 4"),
-    "a name with a comma": (b'"id, n",x,y,z\n1,2,3,4\n', r"line 1 names 5 .*line 2 has 4"),
     "binary": (b"1 2 3\n\x00\x01\x02", r"0x00"),
     "UTF-16": ("1 2 3\n".encode("utf-16"), r"0x00"),
 }
@@ -226,6 +300,14 @@ def test_text_is_never_guessed_from_its_content(tmp_path: Path) -> None:
     with pytest.raises(UnknownFormat):
         read(tmp_path, b"1 2 3\n4 5 6\n", "body")
     assert len(read(tmp_path, b"1 2 3\n4 5 6\n", "body", name="Scan.TXT")) == 2
+
+
+@pytest.mark.parametrize("name", ["a.xyzn", "a.xyzrgb", "a.TSV"])
+def test_tables_of_other_names_are_read_as_tables(name: str, tmp_path: Path) -> None:
+    raw = b"1\t2\t3\t7\n4\t5\t6\t8\n"
+    cloud = read(tmp_path, raw, name)
+    np.testing.assert_array_equal(cloud.attributes["column_4"], [7, 8])
+    assert written(tmp_path, cloud, name) == raw
 
 
 def test_errors_far_down_a_long_file_are_found(tmp_path: Path) -> None:
@@ -254,3 +336,23 @@ def test_every_kind_of_line_end_falls_anywhere_in_a_block(tmp_path: Path, monkey
         for size in range(2, 40):
             monkeypatch.setattr(text, "BLOCK_BYTES", size)
             assert read(tmp_path, raw).xyz[:, 0].tolist() == [10**row for row in range(12)]
+
+
+def test_a_few_long_remarks_take_no_more_memory_than_many(tmp_path: Path) -> None:
+    remarks = (b"9" * (390 if row % 1000 == 0 else 5) for row in range(65_536))
+    raw = b"x,y,z,w\n" + b"".join(b"%d,1.25,2.5,%b\n" % row for row in enumerate(remarks))
+    tracemalloc.start()
+    cloud = read(tmp_path, raw)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 48 << 20
+    np.testing.assert_array_equal(cloud.attributes["w"] > 1e9, np.arange(65_536) % 1000 == 0)
+
+
+@pytest.mark.parametrize("line", [b"#\n", b"\r"])
+def test_endless_lines_above_the_table_are_refused_before_they_take_time(line: bytes, tmp_path: Path) -> None:
+    assert len(read(tmp_path, line * 99_999 + b"1 2 3\n")) == 1
+    began = time.monotonic()
+    with pytest.raises(UnsupportedCloud, match="first 100000 lines, the limit"):
+        read(tmp_path, line * 20_000_000 + b"1 2 3\n")
+    assert time.monotonic() - began < 10
