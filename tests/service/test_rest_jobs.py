@@ -210,7 +210,7 @@ def test_denoise_tells_its_events_and_its_report_on_the_same_response(http: http
     assert end == b"--\r\n"
     # What tells the file from others is said of the file, not of an answer that has more in it.
     assert f"Repr-Digest: {plain.headers['repr-digest']}".encode() in described
-    assert b"Content-Disposition: attachment; filename*=utf-8''" in described
+    assert b'Content-Disposition: attachment; filename="cloud_clean.npy"' in described
     assert not {"repr-digest", "etag"} & set(both.headers)
 
 

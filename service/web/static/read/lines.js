@@ -20,23 +20,33 @@ export function eachLine(bytes, begin, visit) {
 }
 
 export function isSpace(code) {
-  return code === 32 || (code >= 9 && code <= 13);
+  return code === 32 || (code >= 9 && code <= 13) || code === 26; // Ctrl-Z, how DOS ends a file
 }
 
-// Read the numbers of some columns into out[at...]; delimiter: a character code, or 0 for white space.
+// Read the numbers of some columns into out[at...], NaN for none; delimiter: a character code, or 0 for white space.
 export function readColumns(text, start, end, delimiter, columns, out, at) {
   const last = Math.max(...columns);
+  const isEnd = delimiter === 0 ? isSpace : (code) => code === delimiter;
+  const hasQuotes = delimiter !== 0 && text.slice(start, end).includes('"');
+  const isPaired = hasQuotes && text.slice(start, end).split('"').length % 2 === 1;
   let cursor = start;
   for (let column = 0; column <= last; column++) {
     if (delimiter === 0) while (cursor < end && isSpace(text.charCodeAt(cursor))) cursor++;
+    if (cursor > end || (cursor === end && delimiter === 0)) throw new Error("a line has too few columns");
     let stop = cursor;
-    while (stop < end && (delimiter === 0 ? !isSpace(text.charCodeAt(stop)) : text.charCodeAt(stop) !== delimiter)) stop++;
-    if (stop === cursor) throw new Error("a line has too few columns");
+    for (let isQuoted = false; stop < end && (isQuoted || !isEnd(text.charCodeAt(stop))); stop++) {
+      if (isPaired && text.charCodeAt(stop) === 34) isQuoted = !isQuoted;
+    }
     for (let axis = 0; axis < columns.length; axis++) {
-      if (columns[axis] === column) out[at + axis] = Number(text.slice(cursor, stop));
+      if (columns[axis] === column) out[at + axis] = numberIn(text.slice(cursor, stop), hasQuotes);
     }
     cursor = delimiter === 0 ? stop : stop + 1;
   }
+}
+
+function numberIn(cell, hasQuotes) {
+  const bare = hasQuotes ? cell.replace(/^["\s]+|["\s]+$/g, "") : cell.trim();
+  return bare ? Number(bare) : NaN;
 }
 
 // A Float64Array that grows.

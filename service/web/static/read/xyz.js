@@ -8,11 +8,18 @@ const POSITIONS = [
   ["px", "py", "pz"],
   ["pos_x", "pos_y", "pos_z"],
   ...["elevation", "height", "altitude", "z"].map((height) => ["easting", "northing", height]),
+  ...["elev", "elevation", "height", "z"].map((height) => ["east", "north", height]),
+  ["e", "n", "z"],
+  ...["_m", " coordinate", "_coordinate", " coord", "_coord"].map((more) => ["x", "y", "z"].map((axis) => axis + more)),
+  ["x1", "y1", "z1"],
+  ["0", "1", "2"],
 ];
 const UNIT = /\s*(\[.*\]|\(.*\))$/;
 const BEFORE_UNIT = /(?<!\s)\s+(?=[[(])/g;
 const LEAD = /^[^,;\t:]*:\s+/; // columns: x y z
 const NUMBER = /^[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan(\((ind|snan)\))?|inf(inity)?|1\.#(ind|inf|[qs]nan)0*)$/i;
+const SEPARATOR = /^"?sep=.?"?$/i; // Excel's first line
+const MISSING = ["", "na", "null"]; // a cell of a delimited table without a number
 const REMARKS = 20; // the last comments above a table, of which one may be its title
 
 export function readXyz(bytes) {
@@ -22,24 +29,40 @@ export function readXyz(bytes) {
   let names = "";
   const remarks = []; // the last one first
   const begin = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf ? 3 : 0;
+  let numbered = null; // a line that is pandas' 0, 1, 2... or a point: the next one tells
+  const row = (text, start, end) => {
+    const at = rows.next(); // may replace rows.values
+    readColumns(text, start, end, table.delimiter, table.axes, rows.values, at);
+  };
+  const above = (text, start, end, line, isComment) => {
+    if (isComment || SEPARATOR.test(line)) {
+      remarks.unshift(line.replace(/^[#/ ]+/, ""));
+      remarks.length = Math.min(remarks.length, REMARKS);
+    } else if (declared === null && !names && /^\d{1,18}$/.test(line)) declared = Number(line);
+    else if (!names && areNames(line)) names = line.replace(/^[% ]+/, "");
+    else if (!names && numbered === null && areNumbers(line)) numbered = { text, start, end, line };
+    else table = layout(line, names, remarks);
+  };
+  const decide = (following) => {
+    const { text, start, end, line } = numbered;
+    if (goesUnder(line, following)) names = line;
+    else {
+      table = layout(line, names, remarks);
+      row(text, start, end);
+    }
+    numbered = null;
+  };
   eachLine(bytes, begin, (text, start, end) => {
     while (start < end && isSpace(text.charCodeAt(start))) start++;
+    if (numbered) decide(strip(text.slice(start, end)));
     if (start === end) return;
     const isComment = text[start] === "#" || (text[start] === "/" && text[start + 1] === "/");
-    if (table === null) {
-      const line = strip(text.slice(start, end));
-      if (isComment) {
-        remarks.unshift(line.replace(/^[#/ ]+/, ""));
-        remarks.length = Math.min(remarks.length, REMARKS);
-      } else if (declared === null && !names && /^\d{1,18}$/.test(line)) declared = Number(line);
-      else if (!names && areNames(words(line))) names = line.replace(/^[% ]+/, "");
-      else table = layout(line, names, remarks);
-    }
-    if (table !== null && !isComment) {
-      const at = rows.next(); // may replace rows.values
-      readColumns(text, start, end, table.delimiter, table.axes, rows.values, at);
-    }
+    if (table === null) above(text, start, end, strip(text.slice(start, end)), isComment);
+    // One number below a number of points is that of one more scan.
+    if (table === null || isComment || (declared !== null && /^[^ \t-\r,;]+\s*$/.test(text.slice(start, end)))) return;
+    row(text, start, end);
   });
+  if (numbered) decide("");
   return rows.xyz;
 }
 
@@ -74,16 +97,24 @@ function fitted(labels, cells) {
   return labels.length === cells.length ? labels : null;
 }
 
-// Which of the columns so named are x, y and z, where each is named once.
+// Which of the columns so named are x, y and z, where each is named once: so written, or in any case.
 function axesOf(labels) {
-  const plain = labels.map((label) => label.toLowerCase().replace(UNIT, ""));
-  const isOnce = (name) => plain.includes(name) && plain.indexOf(name) === plain.lastIndexOf(name);
-  const three = POSITIONS.find((some) => some.every(isOnce));
-  return three ? three.map((name) => plain.indexOf(name)) : null;
+  const plain = labels.map((label) => label.replace(UNIT, ""));
+  for (const cased of [plain, plain.map(swapcase), plain.map((label) => label.toLowerCase())]) {
+    const isOnce = (name) => cased.includes(name) && cased.indexOf(name) === cased.lastIndexOf(name);
+    const three = POSITIONS.find((some) => some.every(isOnce));
+    if (three) return three.map((name) => cased.indexOf(name));
+  }
+  return null;
+}
+
+function swapcase(label) {
+  return label.replace(/[a-z]/gi, (letter) => (letter < "a" ? letter.toLowerCase() : letter.toUpperCase()));
 }
 
 function delimiterOf(line) {
-  return [";", ","].find((mark) => line.includes(mark));
+  const bare = byQuotes(line).filter((_, part) => part % 2 === 0).join("");
+  return [";", ","].find((mark) => bare.includes(mark));
 }
 
 // White space as the server has it: not what is one in Latin-1 only, half of a letter in UTF-8.
@@ -91,11 +122,37 @@ function strip(text) {
   return text.replace(/^[ \t-\r]+|[ \t-\r]+$/g, "");
 }
 
+// The cells of a line, their quotes taken off.
 function words(line) {
   const text = strip(line);
-  return text ? text.split(delimiterOf(text) ?? /[ \t-\r]+/).map(strip) : [];
+  const mark = delimiterOf(text);
+  if (!mark) return text ? text.split(/[ \t-\r]+/) : [];
+  const parts = byQuotes(text).map((part, number) => (number % 2 ? part.replaceAll(mark, "\0") : part));
+  return parts.join('"').split(mark).map((word) => word.replaceAll("\0", mark).replace(/^[" \t-\r]+|[" \t-\r]+$/g, ""));
 }
 
-function areNames(labels) {
-  return labels.length >= 3 && !labels.some((label) => NUMBER.test(label));
+// Every second part is quoted; one part where quotes are not in pairs.
+function byQuotes(line) {
+  const parts = line.split('"');
+  return parts.length % 2 ? parts : [line];
+}
+
+function areNames(line) {
+  const labels = words(line);
+  const hasGaps = delimiterOf(line) && labels.every((label) => MISSING.includes(label.toLowerCase()));
+  return labels.length >= 3 && !hasGaps && !labels.some((label) => NUMBER.test(label));
+}
+
+// 0, 1, 2..., behind the empty name of an index perhaps.
+function areNumbers(line) {
+  const labels = words(line);
+  const lead = labels[0] === "" ? 1 : 0;
+  return labels.length >= lead + 3 && labels.slice(lead).every((label, column) => label === String(column));
+}
+
+// Whether a line is one of numbers of columns: the row under it has as many cells, and no position is a whole number.
+function goesUnder(line, following) {
+  const [labels, cells] = [words(line), words(following)];
+  const lead = labels[0] === "" ? 1 : 0;
+  return cells.length === labels.length && !cells.slice(lead, lead + 3).some((cell) => /^[-+]*\d+$/.test(cell));
 }
