@@ -44,7 +44,7 @@ def npy(xyz: Any) -> bytes:
 
 
 SMALL = npy(noisy(torus(POINTS), 0.01))
-LARGE = npy(noisy(sphere(60_000), 0.01))  # takes the worker many seconds
+LARGE = npy(noisy(sphere(60_000), 0.01))  # each pass takes the worker seconds
 
 
 @pytest.fixture
@@ -64,8 +64,8 @@ def parts(kind: type, config: Any, body: bytes, size: int = 5000) -> Iterator[An
         yield kind(chunk=body[start : start + size])
 
 
-def denoise_parts(body: bytes, **config: Any) -> Iterator[Any]:
-    job = pb.JobConfig(filename="cloud.npy", options=pb.DenoiseOptions(iterations=1))
+def denoise_parts(body: bytes, *, iterations: int = 1, **config: Any) -> Iterator[Any]:
+    job = pb.JobConfig(filename="cloud.npy", options=pb.DenoiseOptions(iterations=iterations))
     return parts(pb.DenoiseRequest, pb.DenoiseConfig(job=job, **config), body)
 
 
@@ -197,7 +197,8 @@ def test_callers_who_choose_the_same_id_get_the_same_result(server: RunningServe
 def test_a_call_that_ends_early_frees_the_worker_and_leaves_nothing(
     server: RunningServer, stub: Any, ending: str
 ) -> None:
-    call = stub.Denoise(denoise_parts(LARGE, patches=True), timeout=3 if ending == "deadline" else None)
+    upload = denoise_parts(LARGE, iterations=10, patches=True)
+    call = stub.Denoise(upload, timeout=3 if ending == "deadline" else None)
     with suppress(grpc.RpcError):
         for answer in call:
             if ending == "cancel" and answer.WhichOneof("part") == "patch":
