@@ -4,9 +4,10 @@ python -m benchmarks.held_out model/weights/straightpcf.safetensors runs/cvm/sta
     [--shapes boy02 solid001] [--resolution 10000] [--noise 0.02 0.03] [--noise-type gaussian] [--iterations 4]
 
 CD / mean squared height over the surface, x1e-4, in radii of the bounding sphere, of each shape, and their geometric
-means over shapes and seeds. The 50K points of a shape stand for its surface. All candidates get the DistanceModule and
-the calibration of the weights that ship, so only their velocities differ. `--unseen` names an archive of which nothing
-was trained on, like solids made with a seed of their own.
+and arithmetic means over shapes and seeds: the one weighs all shapes alike, the other shows walls that are joined. The
+50K points of a shape stand for its surface. All candidates get the DistanceModule and the calibration of the weights
+that ship, so only their velocities differ. `--unseen` names an archive of which nothing was trained on, like solids
+made with a seed of their own.
 """
 
 from __future__ import annotations
@@ -59,8 +60,9 @@ def main() -> None:
             )
             for seed, row in zip(arguments.seeds, rows, strict=True):
                 print(f"{path!s:40} {noise:.3f} seed {seed}  " + " | ".join(f"{c:.3f} / {h:.3f}" for c, h in row))
-            cd, height = np.exp(np.log(rows).mean(axis=(0, 1)))
-            print(f"{path!s:40} {noise:.3f} mean    {cd:.3f} / {height:.3f}", flush=True)
+            means = {"geometric": np.exp(np.log(rows).mean(axis=(0, 1))), "arithmetic": rows.mean(axis=(0, 1))}
+            said = ", ".join(f"{kind} {cd:.3f} / {height:.3f}" for kind, (cd, height) in means.items())
+            print(f"{path!s:40} {noise:.3f} mean    {said}", flush=True)
 
 
 def _truths(arguments: argparse.Namespace) -> Iterator[tuple[str, Truth]]:

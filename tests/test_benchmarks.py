@@ -106,13 +106,16 @@ def test_candidates_are_compared_on_what_is_held_out(tmp_path: Path) -> None:
     clouds |= {f"{name}/50000": sphere(50_000) for name in "fz"} | {"z/1000": sphere(1000)}
     np.savez(tmp_path / "trained.npz", **{name: xyz for name, xyz in clouds.items() if name[0] != "z"})
     np.savez(tmp_path / "unseen.npz", **{name: xyz for name, xyz in clouds.items() if name[0] == "z"})
-    said = printed(
+    printout = printed(
         "held_out", DEFAULT_WEIGHTS, "--data", tmp_path / "trained.npz", "--unseen", tmp_path / "unseen.npz",
         "--resolution", 1000, "--noise", 0.02, "--seeds", 0, "--iterations", 1, "--threads", 1,
     )  # fmt: skip
-    first, row, mean = said.splitlines()
+    first, row, mean = printout.splitlines()
     assert first.split(" of ")[1] == "f | z"
     assert row.split("seed 0")[1].count(" | ") == 1
-    chamfer, height = map(float, mean.split("mean")[1].split("/"))
-    assert 0 < height < 4  # the noise's own is 4
-    assert chamfer > height
+    said = mean.split("geometric")[1].split(", arithmetic")
+    geometric, arithmetic = ([float(figure) for figure in part.split(" / ")] for part in said)
+    for chamfer, height in (geometric, arithmetic):
+        assert 0 < height < 4  # the noise's own is 4
+        assert chamfer > height
+    assert all(more >= less - 0.001 for less, more in zip(geometric, arithmetic, strict=True))
