@@ -222,9 +222,8 @@ def delete_call(id: str, *, timeout: float | None = None) -> Call:
 
 
 def _job(id: str, part: str = "") -> str:
-    if not isinstance(id, str) or not JOB_ID.fullmatch(
-        id
-    ):  # it would name another path: "" the list of jobs, ".." the page
+    # Any other text would name another path: "" the list of jobs, ".." the page.
+    if not isinstance(id, str) or not JOB_ID.fullmatch(id):
         raise NotFound(f"there is no job {str(id)[:64]!r}; an id is {JOB_ID_RULE}")
     return f"/jobs/{id}" + (f"/{part}" if part else "")
 

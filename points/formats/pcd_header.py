@@ -72,9 +72,8 @@ def read_header(raw: bytes) -> PcdHeader:
         keyword = "FIELDS" if keyword == "COLUMNS" else keyword  # its name in old files
         if keyword in entries:
             raise MalformedFile(f"line {number} of the PCD header is there twice: {shown(line)}")
-        if keyword not in _KEYWORDS and keyword.upper().startswith(
-            _KEYWORDS
-        ):  # COUNTS: without it, rows would be short
+        # COUNTS, say: without it, rows would be short.
+        if keyword not in _KEYWORDS and keyword.upper().startswith(_KEYWORDS):
             raise MalformedFile(f"line {number} of the PCD header is unknown, but nearly a known one: {shown(line)}")
         entries[keyword] = words
     axes = axes_among(entries.get("FIELDS", []))

@@ -104,9 +104,8 @@ def _lines(raw: bytes) -> tuple[list[bytes], int]:
     begin = 0
     lines: list[bytes] = []
     magic = len(b"ply") + (len(BOM) if raw.startswith(BOM) else 0)
-    only_cr = (
-        raw[magic : magic + 1] == b"\r" and raw[magic + 1 : magic + 2] != b"\n"
-    )  # old Mac: a binary body may begin with the byte of LF
+    # Old Mac: a binary body may begin with the byte of LF.
+    only_cr = raw[magic : magic + 1] == b"\r" and raw[magic + 1 : magic + 2] != b"\n"
     while True:
         limit = begin + MAX_LINE_BYTES + 2
         end = -1 if only_cr else raw.find(b"\n", begin, limit)

@@ -27,8 +27,8 @@ export function isSpace(code) {
 export function readColumns(text, start, end, delimiter, columns, out, at) {
   const last = Math.max(...columns);
   const isEnd = delimiter === 0 ? isSpace : (code) => code === delimiter;
-  const hasQuotes = delimiter !== 0 && text.slice(start, end).includes('"');
-  const isPaired = hasQuotes && text.slice(start, end).split('"').length % 2 === 1;
+  const quotes = delimiter === 0 ? 0 : text.slice(start, end).split('"').length - 1;
+  const isPaired = quotes > 0 && quotes % 2 === 0;
   let cursor = start;
   for (let column = 0; column <= last; column++) {
     if (delimiter === 0) while (cursor < end && isSpace(text.charCodeAt(cursor))) cursor++;
@@ -38,7 +38,7 @@ export function readColumns(text, start, end, delimiter, columns, out, at) {
       if (isPaired && text.charCodeAt(stop) === 34) isQuoted = !isQuoted;
     }
     for (let axis = 0; axis < columns.length; axis++) {
-      if (columns[axis] === column) out[at + axis] = numberIn(text.slice(cursor, stop), hasQuotes);
+      if (columns[axis] === column) out[at + axis] = numberIn(text.slice(cursor, stop), quotes > 0);
     }
     cursor = delimiter === 0 ? stop : stop + 1;
   }
