@@ -12,16 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.train.level_set import LevelSet
+
 __all__ = ["Body", "Limb", "carving", "creature"]
 
 Floats = npt.NDArray[np.float64]
-
-# Points are drawn this near to the surface and brought onto it: evenly but for the Gaussian curvature times its square.
-_SHELL = 0.015
-_CELL = 0.08  # of the grid that tells where to draw, before it is halved
-_HALVINGS = 2
-_STEPS = 6  # of Newton's method
-_DRAWN = 400_000  # points at once
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ class Limb:
 
 
 @dataclass(frozen=True)
-class Body:
+class Body(LevelSet):
     """Limbs grown together, with a relief.
 
     blend: how far around a joint it is rounded; waves: (J, 3) wave vectors, phases: (J,), heights: (J,) of the relief.
@@ -77,53 +72,17 @@ class Body:
         angles = xyz @ self.waves.T + self.phases
         return value - np.sin(angles) @ self.heights, gradient - np.cos(angles) * self.heights @ self.waves
 
-    def contains(self, xyz: Floats) -> npt.NDArray[np.bool_]:
-        """Say which points (N, 3) are inside: (N,)."""
-        return np.asarray(self.value(xyz)[0] < 0)
-
-    def sample(self, rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:
-        """Sample `count` points of the surface evenly, and their unit normals."""
-        cells, size = self._cells()
-        found: list[Floats] = []
-        while sum(map(len, found)) < count:
-            drawn = cells[rng.integers(len(cells), size=_DRAWN)] + rng.uniform(-size / 2, size / 2, (_DRAWN, 3))
-            value, gradient = self.value(drawn)
-            found.append(self._onto(drawn[np.abs(value) < _SHELL * np.linalg.norm(gradient, axis=1)]))
-        xyz = np.concatenate(found)[:count]
-        gradient = self.value(xyz)[1]
-        return xyz, gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-
-    def _cells(self) -> tuple[Floats, float]:
-        """Return the centres (M, 3) of grid cells that the surface, as thick as it is drawn, may cross; their side."""
+    def box(self) -> tuple[Floats, Floats]:
+        """Return the corners, (3,) each, of a box around the surface."""
         ends = np.stack([end for limb in self.limbs for end in (limb.start, limb.end)])
         widest = max(max(limb.radii) for limb in self.limbs) + self.blend * np.log(len(self.limbs))
-        margin = widest + np.abs(self.heights).sum() + 2 * _CELL
-        low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
-        grid = np.meshgrid(*(np.arange(low[axis], high[axis], _CELL) for axis in range(3)), indexing="ij")
-        cells, size = self._crossed(np.stack(grid, axis=-1).reshape(-1, 3), _CELL), _CELL
-        for _ in range(_HALVINGS):
-            size /= 2
-            corners = size / 2 * np.stack(np.meshgrid(*3 * [[-1, 1]]), axis=-1).reshape(-1, 3)
-            cells = self._crossed((cells[:, None] + corners).reshape(-1, 3), size)
-        return cells, size
+        margin = widest + np.abs(self.heights).sum()
+        return ends.min(axis=0) - margin, ends.max(axis=0) + margin
 
-    def _crossed(self, centres: Floats, size: float) -> Floats:
-        # The steepest that the function is anywhere: no cell is missed.
+    def slope(self) -> float:
+        """Return the steepest that the function is anywhere, or more."""
         slope = max(limb.flat + abs(limb.radii[1] - limb.radii[0]) for limb in self.limbs)
-        slope += float(np.abs(self.heights) @ np.linalg.norm(self.waves, axis=1))
-        parts = np.array_split(centres, 1 + len(centres) // _DRAWN)
-        value = np.concatenate([self.value(part)[0] for part in parts])
-        crossed: Floats = centres[np.abs(value) < slope * (np.sqrt(3) / 2 * size + _SHELL)]
-        return crossed
-
-    def _onto(self, xyz: Floats) -> Floats:
-        """Bring points (N, 3) onto the surface; those that Newton's method takes elsewhere are left out."""
-        start = xyz
-        for _ in range(_STEPS):
-            value, gradient = self.value(xyz)
-            xyz = xyz - (value / np.square(gradient).sum(axis=1))[:, None] * gradient
-        there = np.abs(self.value(xyz)[0]) < 1e-9
-        return np.asarray(xyz[there & (np.linalg.norm(xyz - start, axis=1) < 3 * _SHELL)])
+        return slope + float(np.abs(self.heights) @ np.linalg.norm(self.waves, axis=1))
 
 
 def _direction(rng: np.random.Generator, across: Floats | None = None) -> Floats:

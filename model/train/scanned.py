@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.train.bodies import Body
+from straightpcf.model.train.level_set import LevelSet
 from straightpcf.model.train.places import PLACES, Place
 from straightpcf.model.train.solids import FAMILIES, Solid
 
@@ -48,7 +48,7 @@ class Scanned:
     """
 
     name: str
-    families: Sequence[Callable[[np.random.Generator], Solid | Body | Place]]
+    families: Sequence[Callable[[np.random.Generator], Solid | LevelSet | Place]]
     dense: int
     surface: int
     distance: tuple[float, float]

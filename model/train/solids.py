@@ -1,6 +1,7 @@
 """Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, and smooth bodies.
 
 python -m straightpcf.model.train.solids solids.npz --count 36
+python -m straightpcf.model.train.solids casings.npz --kind casing
 
 Thin walls are what a denoiser takes for noise, and PUNet's training split has few of them. A solid is a union of parts
 less a union of holes; its surface is sampled exactly, part by part, with no mesh in between. Normals are exact.
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,10 +21,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.train.bodies import Body, carving, creature
+from straightpcf.model.train.bodies import carving, creature
+from straightpcf.model.train.casings import CASINGS, UNSEEN
+from straightpcf.model.train.level_set import LevelSet
 
 __all__ = [
     "FAMILIES",
+    "KINDS",
     "RESOLUTIONS",
     "Box",
     "Cylinder",
@@ -189,30 +193,33 @@ class Solid:
         return held
 
 
-def write_solids(path: Path, count: int, *, seed: int = 0, resolutions: Collection[int] | None = None) -> None:
+def write_solids(
+    path: Path, count: int, *, seed: int = 0, resolutions: Collection[int] | None = None, kind: str = "solid"
+) -> None:
     """Write an .npz of `count` solids as PUNet's training split is written: `solid<number>/<resolution>`, float32.
 
     With them their normals, `solid<number>/normals`, of the points at the finest of RESOLUTIONS. All in the frame where
     the bounding sphere has radius 1. resolutions: those of RESOLUTIONS to train on, all by default; without the finest,
-    that is `solid<number>/surface`. Raises ValueError for any other.
+    that is `solid<number>/surface`. Raises ValueError for any other. kind: another one of KINDS, and its name.
     """
     wanted = RESOLUTIONS if resolutions is None else resolutions
     if not wanted or not set(wanted) <= set(RESOLUTIONS):
         raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, wanted))}")
     arrays = {}
+    families = KINDS[kind]
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         # Every family in turn: as many of each.
-        xyz, normals = FAMILIES[number % len(FAMILIES)](rng).sample(rng, _CANDIDATES * max(RESOLUTIONS))
+        xyz, normals = families[number % len(families)](rng).sample(rng, _CANDIDATES * max(RESOLUTIONS))
         xyz = CloudFrame.of(xyz).enter(xyz)
         for resolution in RESOLUTIONS:
             some = rng.permutation(len(xyz))[: _CANDIDATES * resolution]
             kept = some[fpsample.bucket_fps_kdline_sampling(xyz[some].astype(np.float32), resolution, 7, 0)]
             if resolution in wanted:
-                arrays[f"solid{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
+                arrays[f"{kind}{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
         if resolution not in wanted:
-            arrays[f"solid{number:03d}/surface"] = xyz[kept].astype(np.float32)
-        arrays[f"solid{number:03d}/normals"] = normals[kept].astype(np.float32)
+            arrays[f"{kind}{number:03d}/surface"] = xyz[kept].astype(np.float32)
+        arrays[f"{kind}{number:03d}/normals"] = normals[kept].astype(np.float32)
     np.savez_compressed(path, **arrays)
 
 
@@ -366,7 +373,7 @@ def _blob(rng: np.random.Generator) -> Solid:
     return Solid(parts)
 
 
-FAMILIES: list[Callable[[np.random.Generator], Solid | Body]] = [
+FAMILIES: Sequence[Callable[[np.random.Generator], Solid | LevelSet]] = [
     _bracket,
     _fins,
     _pipes,
@@ -377,6 +384,12 @@ FAMILIES: list[Callable[[np.random.Generator], Solid | Body]] = [
     creature,
     carving,
 ]
+# What an archive may hold; "unseen" is for judging alone.
+KINDS: Mapping[str, Sequence[Callable[[np.random.Generator], Solid | LevelSet]]] = {
+    "solid": FAMILIES,
+    "casing": CASINGS,
+    "unseen": UNSEEN,
+}
 
 
 if __name__ == "__main__":
@@ -384,8 +397,9 @@ if __name__ == "__main__":
     parser.add_argument("path", type=Path)
     parser.add_argument("--count", type=int, default=36)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kind", choices=tuple(KINDS), default="solid")
     parser.add_argument(
         "--resolutions", type=int, nargs="+", choices=RESOLUTIONS, help="those to train on, all by default"
     )
     options = parser.parse_args()
-    write_solids(options.path, options.count, seed=options.seed, resolutions=options.resolutions)
+    write_solids(options.path, options.count, seed=options.seed, resolutions=options.resolutions, kind=options.kind)
