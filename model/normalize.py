@@ -31,8 +31,10 @@ _BEARABLE_NOISE = 0.044  # more is brought to this, below the least factor, too
 LOUD_NOISE = 0.036
 _WAVY, _SHOWN_REST, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
 _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
-# Of noise, in radii of a patch, for each part, and the range of these in which both 1 and 2 do: see `parts_of`.
+# Of noise, in radii of a patch, for each part, and the range of these in which both 1 and 2 do: see `parts_of`. It
+# begins earlier where noise is so large that an object cannot be shown larger for it (`zoom_of`).
 _NOISE_A_PART, _BOTH = 0.062, (1.25, 1.75)
+_SHOWN_AS_IT_IS, _BOTH_THERE_FROM = 0.9 * _SHOWN_NOISE, 1.0
 _MOST_PARTS, _SMALLEST_PART = 6, 2000
 _BLOCK = 2**16  # rows whose distances are held at once
 
@@ -117,7 +119,8 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tu
     """
     wanted = noise_in_radii(noise_std, radii) / _NOISE_A_PART
     most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
-    if _BOTH[0] <= wanted < _BOTH[1] and most > 1:
+    lowest = _BOTH[0] if noise_std < _SHOWN_AS_IT_IS else _BOTH_THERE_FROM
+    if lowest <= wanted < _BOTH[1] and most > 1:
         return (1, 2)
     return (max(1, min(round(wanted), most)),)
 

@@ -56,7 +56,7 @@ def test_waves_that_noise_has_left_are_shown_smaller() -> None:
 def test_a_cloud_is_parted_where_patches_are_small_beside_the_noise() -> None:
     assert parts_of(0.012, np.array([0.1]), 50_000) == (2,)
     assert parts_of(0.03, np.array([0.17]), 50_000) == (3,)
-    assert parts_of(0.03, np.array([0.4]), 10_000) == (1,)
+    assert parts_of(0.03, np.array([0.5]), 10_000) == (1,)
     assert parts_of(0.0, np.array([0.0]), 10_000) == (1,)
 
 
@@ -65,6 +65,9 @@ def test_between_one_part_and_two_a_cloud_is_filtered_as_both() -> None:
         (1,), (1, 2), (1, 2), (2,)
     ]  # fmt: skip
     assert parts_of(0.0093, np.array([0.1]), 3_000) == (1,)
+    # Of noise that is as large as it is ever shown, both do earlier.
+    assert [parts_of(noise, np.array([noise / 0.065]), 10_000) for noise in (0.02, 0.028)] == [(1,), (1, 2)]
+    assert [parts_of(0.03, np.array([radius]), 10_000) for radius in (0.485, 0.483)] == [(1,), (1, 2)]
 
 
 @given(st.floats(0, 1), st.floats(0, 1), st.integers(1, 200_000))
