@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.train.solids import Box, Cylinder, Ellipsoid, Primitive, Solid, along, pose
+from straightpcf.model.train.primitives import Box, Cylinder, Ellipsoid, Primitive, Solid, along, pose
 
 __all__ = ["PLACES", "Place"]
 

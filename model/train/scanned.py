@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.level_set import LevelSet
 from straightpcf.model.train.places import PLACES, Place
-from straightpcf.model.train.solids import FAMILIES, Solid
+from straightpcf.model.train.primitives import Solid
+from straightpcf.model.train.solids import FAMILIES
 
 __all__ = ["COUNTS", "SCANNED_PLACES", "SCANNED_SOLIDS", "Scanned", "Scanner", "write_scanned"]
 

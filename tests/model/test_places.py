@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.places import PLACES, Place
+from straightpcf.model.train.primitives import Box
 from straightpcf.model.train.scanned import Scanner
-from straightpcf.model.train.solids import Box
 
 
 @pytest.mark.parametrize("place", dict.fromkeys(PLACES), ids=lambda place: place.__name__.strip("_"))

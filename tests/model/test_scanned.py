@@ -15,9 +15,9 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import scanned
 from straightpcf.model.train.data import ALONG_BEAMS, NOISE_STD, PatchSource, drawn_noise
 from straightpcf.model.train.device_data import DevicePatchSource
+from straightpcf.model.train.primitives import Box, Ellipsoid, Solid
 from straightpcf.model.train.record import write_passed
 from straightpcf.model.train.scanned import SCANNED_PLACES, SCANNED_SOLIDS, Scanned, Scanner, write_scanned
-from straightpcf.model.train.solids import Box, Ellipsoid, Solid
 
 EYE = np.array([0.3, -0.2, 4.0])
 

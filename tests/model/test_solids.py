@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.train import solids
 from straightpcf.model.train.data import PatchSource
-from straightpcf.model.train.solids import FAMILIES, Box, Cylinder, Ellipsoid, Solid, write_solids
+from straightpcf.model.train.primitives import Box, Cylinder, Ellipsoid, Solid
+from straightpcf.model.train.solids import FAMILIES, write_solids
 
 
 @pytest.mark.parametrize("family", range(len(FAMILIES)))
