@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from straightpcf.model.train.level_set import LevelSet
 
-__all__ = ["Body", "Limb", "carving", "creature"]
+__all__ = ["Body", "Limb", "carving", "creature", "direction"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class Body(LevelSet):
         return slope + float(np.abs(self.heights) @ np.linalg.norm(self.waves, axis=1))
 
 
-def _direction(rng: np.random.Generator, across: Floats | None = None) -> Floats:
+def direction(rng: np.random.Generator, across: Floats | None = None) -> Floats:
     """Return a unit vector, at right angles to `across` where that is given."""
     way = rng.standard_normal(3)
     if across is not None:
@@ -94,14 +94,14 @@ def _direction(rng: np.random.Generator, across: Floats | None = None) -> Floats
 
 
 def _limb(rng: np.random.Generator, start: Floats, end: Floats, radii: tuple[float, float], flat: float = 1.0) -> Limb:
-    return Limb(start, end, radii, _direction(rng, end - start), flat)
+    return Limb(start, end, radii, direction(rng, end - start), flat)
 
 
 def _relief(rng: np.random.Generator, lengths: tuple[float, float], slope: float) -> tuple[Floats, Floats, Floats]:
     """Return waves of such lengths whose slopes add up to `slope` on average: wave vectors, phases, heights."""
     count = int(rng.integers(3, 9))
     wave = 2 * np.pi / np.exp(rng.uniform(np.log(lengths[0]), np.log(lengths[1]), count))
-    vectors = wave[:, None] * np.stack([_direction(rng) for _ in range(count)])
+    vectors = wave[:, None] * np.stack([direction(rng) for _ in range(count)])
     return vectors, rng.uniform(0, 2 * np.pi, count), slope / np.sqrt(count) / wave
 
 
@@ -112,21 +112,21 @@ def creature(rng: np.random.Generator) -> Body:
     for _ in range(rng.integers(2, 5)):
         root = rng.uniform(-1, 1) * spine
         thick = rng.uniform(0.07, 0.22)
-        knee = root + rng.uniform(0.5, 1.0) * _direction(rng)
-        foot = knee + rng.uniform(0.3, 0.8) * _direction(rng)
+        knee = root + rng.uniform(0.5, 1.0) * direction(rng)
+        foot = knee + rng.uniform(0.3, 0.8) * direction(rng)
         narrow = rng.uniform(0.5, 1.0)
         for mirror in (np.ones(3), np.array([-1.0, 1, 1])):
             limbs.append(_limb(rng, root * mirror, knee * mirror, (1.2 * thick, thick)))
             limbs.append(_limb(rng, knee * mirror, foot * mirror, (thick, narrow * thick)))
-    head = 1.2 * spine + 0.5 * _direction(rng) * [0.2, 1, 1]
-    snout = head + rng.uniform(0.1, 0.5) * _direction(rng) * [0.2, 1, 1]
+    head = 1.2 * spine + 0.5 * direction(rng) * [0.2, 1, 1]
+    snout = head + rng.uniform(0.1, 0.5) * direction(rng) * [0.2, 1, 1]
     limbs.append(_limb(rng, 0.9 * spine, head, (0.2, 0.25)))
     limbs.append(_limb(rng, head, snout, (rng.uniform(0.2, 0.35), rng.uniform(0.1, 0.25))))
-    ear, size = rng.uniform(0.25, 0.6) * _direction(rng), rng.uniform(0.15, 0.3)
+    ear, size = rng.uniform(0.25, 0.6) * direction(rng), rng.uniform(0.15, 0.3)
     flat = rng.uniform(2, 4)
     for mirror in (np.ones(3), np.array([-1.0, 1, 1])):
         limbs.append(_limb(rng, head, head + ear * mirror, (size, 0.6 * size), flat))
-    limbs.append(_limb(rng, -spine, -spine + rng.uniform(0.4, 1.2) * _direction(rng), (0.12, rng.uniform(0.04, 0.1))))
+    limbs.append(_limb(rng, -spine, -spine + rng.uniform(0.4, 1.2) * direction(rng), (0.12, rng.uniform(0.04, 0.1))))
     return Body(limbs, rng.uniform(0.02, 0.06), *_relief(rng, (0.2, 0.8), rng.uniform(0, 0.25)))
 
 
@@ -135,7 +135,7 @@ def carving(rng: np.random.Generator) -> Body:
     centres = rng.uniform(-0.6, 0.6, (rng.integers(3, 7), 3))
     limbs = []
     for centre in centres:
-        end = centre + rng.uniform(0.2, 1.0) * _direction(rng)
+        end = centre + rng.uniform(0.2, 1.0) * direction(rng)
         radii = rng.uniform(0.25, 0.6, 2)
         limbs.append(_limb(rng, centre, end, (radii[0], radii[1]), rng.uniform(1, 2.5)))
     return Body(limbs, rng.uniform(0.02, 0.12), *_relief(rng, (0.15, 0.7), rng.uniform(0.25, 0.7)))

@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from straightpcf.model.train.bodies import direction
 from straightpcf.model.train.fields import (
     Field,
+    ball,
     block,
     intersection,
     less,
@@ -27,6 +29,7 @@ from straightpcf.model.train.fields import (
     widened,
 )
 from straightpcf.model.train.level_set import LevelSet
+from straightpcf.model.train.primitives import log_uniform
 
 __all__ = ["CASINGS", "UNSEEN", "Casing", "casing", "lattice", "scroll", "sheet", "vessel"]
 
@@ -58,7 +61,7 @@ class Casing(LevelSet):
 
 
 def _wall(rng: np.random.Generator) -> float:
-    return float(np.exp(rng.uniform(*np.log(_WALL))))
+    return log_uniform(rng, _WALL)
 
 
 def _seam(wall: float) -> float:
@@ -68,11 +71,6 @@ def _seam(wall: float) -> float:
 
 def _turned(rng: np.random.Generator) -> Floats:
     return np.asarray(Rotation.random(random_state=rng).as_matrix())
-
-
-def _along(direction: Floats) -> Floats:
-    """Return a pose whose z axis points along a direction (3,)."""
-    return np.asarray(Rotation.align_vectors(direction[None], _UP[None])[0].as_matrix())
 
 
 def casing(rng: np.random.Generator) -> Casing:
@@ -103,8 +101,7 @@ def casing(rng: np.random.Generator) -> Casing:
     for _ in range(rng.integers(0, 4)):  # windows
         turn = np.roll(np.eye(3), rng.integers(3), axis=1)
         holes.append(moved(post(rng.uniform(0.1, 0.45), 3.0, 0.0), rng.uniform(-0.7, 0.7, 3), turn))
-    way, cut = rng.standard_normal(3), rng.uniform(0.1, 0.7)
-    way /= np.linalg.norm(way)
+    way, cut = direction(rng), rng.uniform(0.1, 0.7)
     if rng.random() < 0.5:
         way = np.eye(3)[rng.integers(3)]
     if rng.random() < 0.5:  # a flange around what is open
@@ -194,8 +191,7 @@ def sheet(rng: np.random.Generator) -> Casing:
         if holes:
             flat = less(seam, flat, *holes)
         parts.append(moved(flat, rng.uniform(-0.35, 0.35, 3), _turned(rng)))
-    ball = widened(torus(0.0, 1.0), 0.9)
-    return Casing(intersection(0.01, union(0.01, *parts), ball), np.full(3, 2.0))
+    return Casing(intersection(0.01, union(0.01, *parts), ball(1.9)), np.full(3, 2.0))
 
 
 def lattice(rng: np.random.Generator) -> Casing:
@@ -209,7 +205,7 @@ def lattice(rng: np.random.Generator) -> Casing:
         gradient = wave * (cosine * np.roll(cosine, -1, axis=1) - sine * np.roll(sine, 1, axis=1))
         return value / (np.sqrt(3) * wave), gradient / (np.sqrt(3) * wave)
 
-    outline = [widened(torus(0.0, 1.0), 0.0), block(np.full(3, 0.8), 0.1), post(0.8, 0.9, 0.1)][rng.integers(3)]
+    outline = [ball(1.0), block(np.full(3, 0.8), 0.1), post(0.8, 0.9, 0.1)][rng.integers(3)]
     turn = _turned(rng)
     return Casing(intersection(_seam(wall), moved(shell(gyroid, wall), np.zeros(3), turn), outline), np.full(3, 1.2))
 

@@ -11,7 +11,20 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Field", "block", "intersection", "less", "moved", "plane", "post", "shell", "torus", "union", "widened"]
+__all__ = [
+    "Field",
+    "ball",
+    "block",
+    "intersection",
+    "less",
+    "moved",
+    "plane",
+    "post",
+    "shell",
+    "torus",
+    "union",
+    "widened",
+]
 
 Floats = npt.NDArray[np.float64]
 Field = Callable[[Floats], tuple[Floats, Floats]]
@@ -59,6 +72,11 @@ def torus(radius: float, tube: float) -> Field:
         return length - tube, np.column_stack([off[:, :1] / length[:, None] * out, off[:, 1] / length])
 
     return field
+
+
+def ball(radius: float) -> Field:
+    """Return a ball about the origin."""
+    return torus(0.0, radius)
 
 
 def moved(field: Field, centre: Floats, turn: Floats) -> Field:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.train.primitives import Box, Cylinder, Ellipsoid, Primitive, Solid, along, pose
+from straightpcf.model.train.primitives import Box, Cylinder, Ellipsoid, Primitive, Solid, along, log_uniform, pose
 
 __all__ = ["PLACES", "Place"]
 
@@ -117,7 +117,7 @@ def _tree(rng: np.random.Generator) -> Place:
     for _ in range(rng.integers(5, 20)):
         tip = crown + _in_ball(rng) * reach
         parts.append(_rod(fork, tip, _thin(rng) / 2))
-    size = np.exp(rng.uniform(*np.log((0.02, 0.1))))
+    size = log_uniform(rng, (0.02, 0.1))
     for _ in range(rng.integers(40, 160)):
         half = size * np.array([1.0, rng.uniform(0.4, 1.0), rng.choice([0.1, 0.5, 1.0])])
         turn = Rotation.random(random_state=rng).as_matrix()
@@ -213,7 +213,7 @@ def _above(place: Floats, high: float) -> Floats:
 
 
 def _thin(rng: np.random.Generator) -> float:
-    return float(np.exp(rng.uniform(*np.log(_ROD))))
+    return log_uniform(rng, _ROD)
 
 
 def _in_ball(rng: np.random.Generator) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-__all__ = ["Box", "Cylinder", "Ellipsoid", "Primitive", "Ring", "Solid", "along", "pose"]
+__all__ = ["Box", "Cylinder", "Ellipsoid", "Primitive", "Ring", "Solid", "along", "log_uniform", "pose"]
 
 Floats = npt.NDArray[np.float64]
 Samples = tuple[Floats, Floats]  # points (N, 3) and their unit normals (N, 3)
@@ -160,6 +160,11 @@ class Solid:
         for body in bodies:
             held |= body.contains(xyz)
         return held
+
+
+def log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """Draw a size whose logarithm is uniform between those of two bounds."""
+    return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
 def pose(rng: np.random.Generator, z: int) -> Floats:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.level_set import LevelSet
 from straightpcf.model.train.places import PLACES, Place
-from straightpcf.model.train.primitives import Solid
+from straightpcf.model.train.primitives import Solid, log_uniform
 from straightpcf.model.train.solids import FAMILIES
 
 __all__ = ["COUNTS", "SCANNED_PLACES", "SCANNED_SOLIDS", "Scanned", "Scanner", "write_scanned"]
@@ -133,10 +133,10 @@ def write_scanned(path: Path, count: int, *, seed: int = 0, what: Scanned = SCAN
         xyz = CloudFrame.of(xyz).enter(xyz)
         if way is None:
             way = rng.standard_normal(3)
-        eye = way / np.linalg.norm(way) * np.exp(rng.uniform(*np.log(what.distance)))
+        eye = way / np.linalg.norm(way) * log_uniform(rng, what.distance)
         scanner = Scanner(xyz, normals, eye, rng.uniform(0, 2 * np.pi))
         for wanted in COUNTS:
-            aspect = np.exp(rng.uniform(*np.log(_ASPECT))) if rng.random() < 0.5 else 1.0
+            aspect = log_uniform(rng, _ASPECT) if rng.random() < 0.5 else 1.0
             points = scanner.raster(rng, wanted, aspect, shifted=bool(rng.random() < 0.3))
             arrays[f"{name}/{len(points)}"] = points.astype(np.float32)
         kept = fpsample.bucket_fps_kdline_sampling(xyz.astype(np.float32), what.surface, 7, 0)

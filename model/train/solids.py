@@ -22,7 +22,17 @@ from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.bodies import carving, creature
 from straightpcf.model.train.casings import CASINGS, UNSEEN
 from straightpcf.model.train.level_set import LevelSet
-from straightpcf.model.train.primitives import Box, Cylinder, Ellipsoid, Primitive, Ring, Solid, along, pose
+from straightpcf.model.train.primitives import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Primitive,
+    Ring,
+    Solid,
+    along,
+    log_uniform,
+    pose,
+)
 
 __all__ = ["FAMILIES", "KINDS", "RESOLUTIONS", "write_solids"]
 
@@ -66,7 +76,7 @@ def write_solids(
 
 
 def _wall(rng: np.random.Generator) -> float:
-    return float(np.exp(rng.uniform(*np.log(_WALL))))
+    return log_uniform(rng, _WALL)
 
 
 def _bracket(rng: np.random.Generator) -> Solid:

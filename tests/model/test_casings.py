@@ -15,6 +15,7 @@ from straightpcf.model.train.casings import CASINGS, UNSEEN, Casing
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.fields import (
     Field,
+    ball,
     block,
     intersection,
     less,
@@ -54,9 +55,7 @@ def test_a_fields_gradient_is_that_of_its_value_and_no_steeper_than_1(name: str)
 
 
 def test_a_shell_is_as_thick_as_it_says() -> None:
-    xyz, normals = Casing(shell(widened(torus(0.0, 0.0), 0.7), 0.1), np.full(3, 1.0)).sample(
-        np.random.default_rng(0), 20_000
-    )
+    xyz, normals = Casing(shell(ball(0.7), 0.1), np.full(3, 1.0)).sample(np.random.default_rng(0), 20_000)
     reach = np.linalg.norm(xyz, axis=1)
     outer = reach > 0.7
     assert reach[outer] == pytest.approx(0.75, abs=1e-6)
