@@ -17,45 +17,55 @@ import subprocess
 import tempfile
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import torch
 
-__all__ = ["EdgeMax", "build", "build_all", "instruction_sets", "knn", "load", "packed"]
+__all__ = ["EdgeMax", "Packing", "build", "build_all", "instruction_sets", "knn", "load", "packed"]
 
 _SOURCES = tuple(sorted(Path(__file__).parent.glob("*.cpp")))
 _HEADERS = tuple(sorted(Path(__file__).parent.glob("*.h")))
 _SHIPPED = Path(__file__).with_name("lib")
 _AVX2 = "-mavx2 -mfma -mbmi -mbmi2"
 _AVX512 = f"-mavx512f -mavx512bw -mavx512dq -mavx512vl {_AVX2}"
-# Of x86, newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
-_INSTRUCTION_SETS = {
+# Newest first. Each name is what /proc/cpuinfo must list; the value is what the compiler is told.
+_X86 = {
     "amx_bf16": f"-mamx-tile -mamx-bf16 -mavx512bf16 {_AVX512}",
-    "avx512_bf16": f"-mavx512bf16 {_AVX512}",
+    "avx512_bf16": f"-mavx512bf16 -mavx512vnni {_AVX512}",  # no processor has the first without the second
+    "avx512_vnni": f"-mavx512vnni {_AVX512}",
     "avx512bw": _AVX512,
+    "avx_vnni": f"-mavxvnni {_AVX2}",
     "avx2": _AVX2,
     "generic": "",
 }
+_ARM = {"asimddp": "-march=armv8.2-a+dotprod", "generic": ""}
 # Sums may be reordered. Not -ffast-math: it lets the compiler drop the comparisons that the selection relies on, and
 # gcc links code into such a library that makes the whole process flush subnormal numbers to zero.
 _REORDER = "-fassociative-math -fno-signed-zeros -fno-trapping-math -fno-math-errno -freciprocal-math"
 _FLAGS = f"-O3 -std=c++17 -fPIC -shared {_REORDER} -Wno-psabi"
 _BUILD_SECONDS = 120
+Packing = Literal["edge_max", "edge_max_coarse", "linear"]  # the kernel that a weight is packed for
 
 
 @functools.cache
 def instruction_sets() -> tuple[str, ...]:
     """Name the instruction sets this processor has among those the kernels are compiled for, newest first."""
-    if not _is_x86():  # under emulation /proc/cpuinfo may be the host's
-        return ("generic",)
     try:
-        listed = set(Path("/proc/cpuinfo").read_text().split())
-    except OSError:
-        return ("generic",)
+        listed = set(Path("/proc/cpuinfo").read_text().split())  # under emulation it may be the host's
+    except OSError:  # not Linux; all of Apple's own processors have these
+        listed = {"asimddp"} if platform.system() == "Darwin" else set()
     if not (listed >= {"amx_tile", "avx512_bf16"} and _tiles_granted()):
         listed.discard("amx_bf16")
     if "GenuineIntel" in listed:  # outside the tiles its products of bfloat16 take 1.5 times as long as float32's
         listed.discard("avx512_bf16")
-    return tuple(name for name in _INSTRUCTION_SETS if name in listed or name == "generic")
+    return tuple(name for name in _compiled_sets() if name in listed or name == "generic")
+
+
+def _compiled_sets() -> dict[str, str]:
+    """Return the instruction sets that there are kernels for on this architecture, with their flags."""
+    if platform.machine() in ("x86_64", "AMD64"):
+        return _X86
+    return _ARM if platform.machine() in ("aarch64", "arm64") else {"generic": ""}
 
 
 def _tiles_granted() -> bool:
@@ -99,7 +109,7 @@ def build(folder: Path, target_set: str) -> Path:
     target = folder / _file_name(target_set)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         built = Path(scratch) / "kernel.so"
-        flags = [*_FLAGS.split(), *_INSTRUCTION_SETS[target_set].split()]
+        flags = [*_FLAGS.split(), *_compiled_sets()[target_set].split()]
         command = [compiler, *flags, *map(str, _SOURCES), "-o", str(built)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_SECONDS, check=False)
         if done.returncode != 0:
@@ -115,11 +125,7 @@ def _cache() -> Path:
 
 def build_all(folder: Path) -> list[Path]:
     """Compile for every instruction set of this architecture, as an image does that does not know its processor."""
-    return [build(folder, name) for name in _INSTRUCTION_SETS if name == "generic" or _is_x86()]
-
-
-def _is_x86() -> bool:
-    return platform.machine() in ("x86_64", "AMD64")
+    return [build(folder, name) for name in _compiled_sets()]
 
 
 def _file_name(target_set: str) -> str:
@@ -130,7 +136,7 @@ def _file_name(target_set: str) -> str:
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused", "pack_linear"):
+    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused", "pack_coarse", "pack_linear"):
         getattr(library, f"straightpcf_{name}").restype = None
     library.straightpcf_products_are_bf16.restype = ctypes.c_int
     return library
@@ -150,14 +156,18 @@ def knn(library: ctypes.CDLL, x: torch.Tensor, k: int, rows: int) -> torch.Tenso
     return out
 
 
-def packed(library: ctypes.CDLL, weight: torch.Tensor, *, edges: bool) -> torch.Tensor:
-    """Return a weight (D, C) float32 as the kernels read it.
+def packed(library: ctypes.CDLL, weight: torch.Tensor, kernel: Packing) -> torch.Tensor:
+    """Return a weight (D, C) float32 as a kernel reads it.
 
-    edges: for the maximum over edges, D a multiple of 16 and C even; else for a linear layer, both multiples of 32.
+    kernel: "edge_max", D a multiple of 16 and C even; "edge_max_coarse" or "linear", both multiples of 32.
     """
     weight = weight.contiguous()
     out = torch.empty_like(weight)
-    pack = library.straightpcf_pack if edges else library.straightpcf_pack_linear
+    pack = {
+        "edge_max": library.straightpcf_pack,
+        "edge_max_coarse": library.straightpcf_pack_coarse,
+        "linear": library.straightpcf_pack_linear,
+    }[kernel]
     pack(_at(weight), weight.shape[1], weight.shape[0], _at(out))
     return out
 
@@ -171,7 +181,7 @@ class EdgeMax(torch.autograd.Function):
         batch, rows, width = a.shape
         k, out_width = index.shape[2], weight.shape[0]
         a, b, weight = a.contiguous(), b.contiguous(), weight.contiguous()
-        ready = packed(library, weight, edges=True)
+        ready = packed(library, weight, "edge_max")
         out = torch.empty(batch, rows, out_width)
         arg = torch.empty(batch, rows, out_width, dtype=torch.uint8) if want_grad else None
         for i in range(batch):

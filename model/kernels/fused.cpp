@@ -57,15 +57,19 @@ void layer(const float* x, int stride, const float* weight, const float* bias, i
 }
 
 // out (rows, out_stride) = max_j MLP([x_i, x_j - x_i]) + Lin(x_i), x (count, stride), by the graph of `features`.
+// The last block has no activation, and no graph that an error would change.
 void edge_conv(const float* x, int count, int stride, int width, const float* features, int dims, int rows, int k,
-               const Block& w, int out_width, bool activation, float* a, float* b, float* edges, int32_t* index,
+               const Block& w, int out_width, bool last, float* a, float* b, float* edges, int32_t* index,
                float* out, int out_stride) {
   straightpcf_knn(features, count, dims, rows, k, index);
   layer(x, stride, w.own, w.own_bias, rows, width, out_width, a);
   layer(x, stride, w.other, w.other_bias, count, width, out_width, b);
-  straightpcf_edge_max(a, b, index, w.second, rows, k, out_width, out_width, edges, nullptr);
+  if (last)
+    straightpcf_edge_max_coarse(a, b, index, w.second, rows, k, out_width, out_width, edges);
+  else
+    straightpcf_edge_max(a, b, index, w.second, rows, k, out_width, out_width, edges, nullptr);
   layer(x, stride, w.lin, w.lin_bias, rows, width, out_width, a);
-  const vec least = splat(activation ? 0.0f : -3.4e38f);
+  const vec least = splat(last ? -3.4e38f : 0.0f);
   for (int i = 0; i < rows; ++i)
     for (int c = 0; c < out_width; c += LANES) {
       const vec edge = load(edges + (size_t)i * out_width + c) + load(w.second_bias + c);
@@ -93,16 +97,16 @@ void straightpcf_fused(const float* x, int count, int rows, int k, const float* 
   int32_t* index = reinterpret_cast<int32_t*>(buffers.take(points * k));
   Block blocks[3];
   std::memcpy(blocks, layers, sizeof blocks);
-  const float* const* decoder = layers + sizeof blocks / sizeof *layers;
+  const float* const* decoder = layers + sizeof blocks / sizeof(float*);
 
-  edge_conv(x, count, 3, 3, x, 3, count, k, blocks[0], first, true, a, b, edges, index, both, joined);
+  edge_conv(x, count, 3, 3, x, 3, count, k, blocks[0], first, false, a, b, edges, index, both, joined);
   for (int i = 0; i < count; ++i)
     std::memcpy(features + (size_t)i * first, both + (size_t)i * joined, first * sizeof(float));
-  edge_conv(both, count, joined, first, features, first, count, k, blocks[1], second, true, a, b, edges, index,
+  edge_conv(both, count, joined, first, features, first, count, k, blocks[1], second, false, a, b, edges, index,
             both + first, joined);
   for (int i = 0; i < count; ++i)
     std::memcpy(features + (size_t)i * second, both + (size_t)i * joined + first, second * sizeof(float));
-  edge_conv(both, count, joined, joined, features, second, rows, k, blocks[2], third, false, a, b, edges, index, whole,
+  edge_conv(both, count, joined, joined, features, second, rows, k, blocks[2], third, true, a, b, edges, index, whole,
             third);
 
   straightpcf_linear(whole, third, decoder[0], decoder[1], rows, third, hidden, 1, a);

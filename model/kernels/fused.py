@@ -35,7 +35,8 @@ class Fused:
         first, second, _ = outs = [block.lin.out_features for block in blocks]
         # Block 3 sees the first two blocks' features side by side, each filled up by itself.
         ins = [[3], [first], [first, second]]
-        self._kept = [each for block, parts in zip(blocks, ins, strict=True) for each in self._block(block, parts)]
+        maxima: list[cpu.Packing] = ["edge_max", "edge_max", "edge_max_coarse"]
+        self._kept = [each for args in zip(blocks, ins, maxima, strict=True) for each in self._block(*args)]
         self._kept += self._decoder(decoder)
         self._layers = (ctypes.c_void_p * len(self._kept))(*(each.data_ptr() for each in self._kept))
         self.out_width = decoder.lin_3.out_features
@@ -55,14 +56,14 @@ class Fused:
             )  # fmt: skip
         return out
 
-    def _block(self, block: EdgeConv, parts: list[int]) -> Iterator[torch.Tensor]:
+    def _block(self, block: EdgeConv, parts: list[int], maximum: cpu.Packing) -> Iterator[torch.Tensor]:
         """Yield what `Block` in fused.cpp lists; parts: the widths of the inputs that lie side by side."""
         hidden, second = (layer for layer in block.mlp if isinstance(layer, nn.Linear))
         own, other = hidden.weight.chunk(2, dim=1)
         layer = self._exact if parts == [3] else partial(self._layer, parts=parts)
         yield from layer(own - other, hidden.bias)  # the first layer runs per point, not per edge
         yield from layer(other, torch.zeros_like(hidden.bias))
-        yield from self._layer(second.weight, second.bias, [second.in_features], edges=True)
+        yield from self._layer(second.weight, second.bias, [second.in_features], maximum)
         yield from layer(block.lin.weight, block.lin.bias)
 
     def _decoder(self, decoder: Decoder) -> Iterator[torch.Tensor]:
@@ -75,7 +76,7 @@ class Fused:
         yield from self._exact(decoder.lin_3.weight, decoder.lin_3.bias)
 
     def _layer(
-        self, weight: torch.Tensor, bias: torch.Tensor, parts: list[int], *, edges: bool = False
+        self, weight: torch.Tensor, bias: torch.Tensor, parts: list[int], kernel: cpu.Packing = "linear"
     ) -> Iterator[torch.Tensor]:
         """Yield a weight (D, C), packed, and its bias (D,), filled up: the C columns part by part."""
         rows, starts = _filled(len(weight)) - len(weight), [sum(parts[:n]) for n in range(len(parts))]
@@ -83,7 +84,7 @@ class Fused:
             nn.functional.pad(weight[:, start : start + part], (0, _filled(part) - part, 0, rows))
             for start, part in zip(starts, parts, strict=True)
         ]
-        yield cpu.packed(self._library, torch.cat(columns, dim=1), edges=edges)
+        yield cpu.packed(self._library, torch.cat(columns, dim=1), kernel)
         yield nn.functional.pad(bias, (0, rows))
 
     @staticmethod

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import platform
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,15 +26,17 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     cpu.instruction_sets.cache_clear()
 
 
-_EVERY = ["amx_bf16", "avx512_bf16", "avx512bw", "avx2", "generic"]
+_EVERY = ["amx_bf16", "avx512_bf16", "avx512_vnni", "avx512bw", "avx_vnni", "avx2", "generic"]
 
 
 @pytest.mark.parametrize(
     ("machine", "flags", "taken", "in_an_image"),
     [
         # Under emulation /proc/cpuinfo may list what the host has.
-        ("aarch64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
-        ("arm64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
+        ("aarch64", "avx2 avx512bw avx512_bf16", "generic", ["asimddp", "generic"]),
+        ("arm64", "avx2 avx512bw avx512_bf16", "generic", ["asimddp", "generic"]),
+        ("aarch64", "fp asimd asimdhp asimddp", "asimddp", ["asimddp", "generic"]),
+        ("x86_64", "fp asimd asimdhp asimddp", "generic", _EVERY),
         ("riscv64", "avx2 avx512bw avx512_bf16", "generic", ["generic"]),
         ("x86_64", "fma avx2", "avx2", _EVERY),
         ("AMD64", "fma avx2", "avx2", _EVERY),
@@ -40,6 +44,9 @@ _EVERY = ["amx_bf16", "avx512_bf16", "avx512bw", "avx2", "generic"]
         ("x86_64", "avx2 avx512bw amx_tile amx_bf16", "avx512bw", _EVERY),  # what a hypervisor may leave
         ("x86_64", "AuthenticAMD avx2 avx512bw avx512_bf16", "avx512_bf16", _EVERY),
         ("x86_64", "GenuineIntel avx2 avx512bw avx512_bf16", "avx512bw", _EVERY),
+        ("x86_64", "GenuineIntel avx2 avx512bw avx512_vnni avx512_bf16", "avx512_vnni", _EVERY),
+        ("x86_64", "GenuineIntel avx2 avx512bw avx512_vnni", "avx512_vnni", _EVERY),
+        ("x86_64", "GenuineIntel avx2 avx_vnni", "avx_vnni", _EVERY),
         ("x86_64", "GenuineIntel avx2 avx512bw avx512_bf16 amx_tile amx_bf16", "amx_bf16", _EVERY),
     ],
 )
@@ -53,6 +60,16 @@ def test_a_machine_compiles_and_takes_the_kernels_of_its_architecture(
     assert cpu.instruction_sets()[0] == taken
     cpu.build_all(tmp_path)
     assert asked == in_an_image
+
+
+def test_apple_s_processors_have_products_of_bytes(asked: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(path: Path) -> str:
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(platform, "machine", lambda: "arm64")
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+    monkeypatch.setattr(Path, "read_text", missing)
+    assert cpu.instruction_sets() == ("asimddp", "generic")
 
 
 def test_without_the_kernels_leave_a_processor_s_tiles_are_not_used(
@@ -105,5 +122,49 @@ def test_the_kernels_of_every_instruction_set_agree(monkeypatch: pytest.MonkeyPa
         assert (ops.knn(b, 20).sort().values == neighbours).float().mean() > 0.999, name
         error = 5e-3 if "bf16" in name else 1e-6
         assert float((ops.edge_max(a, b, index, weight) - expected).norm() / expected.norm()) < error, name
+        error = 2e-2 if "bf16" in name or "vnni" in name else 4e-6
         with torch.no_grad():
-            assert float((module(b[:, :, :3]) - velocities).norm() / velocities.norm()) < 4 * error, name
+            assert float((module(b[:, :, :3]) - velocities).norm() / velocities.norm()) < error, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("flags", "coarse"), [("", 1e-6), ("-march=armv8.2-a+dotprod", 1e-2)])
+def test_kernels_for_arm_agree_with_float64(flags: str, coarse: float, tmp_path: Path) -> None:
+    """Under emulation: no such processor is here."""
+    compiler, emulator = shutil.which("aarch64-linux-gnu-g++"), shutil.which("qemu-aarch64")
+    if compiler is None or emulator is None:
+        pytest.skip("no compiler and emulator for aarch64: apt install g++-aarch64-linux-gnu qemu-user")
+    program = tmp_path / "check"
+    sources = [Path(__file__).with_name("edge_max_check.cpp"), *cpu._SOURCES]
+    command = [compiler, "-O3", "-std=c++17", "-static", *flags.split(), f"-I{cpu._SOURCES[0].parent}"]
+    subprocess.run([*command, *sources, "-o", program], check=True)
+    for width, k in ((32, 1), (96, 9), (256, 32), (64, 33)):
+        done = subprocess.run([emulator, program, str(width), str(k)], check=True, capture_output=True, text=True)
+        errors = [float(error) for error in done.stdout.split()]
+        assert errors[0] < 1e-6
+        assert errors[1] < coarse
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("k", [1, 9, 32, 33])
+@pytest.mark.parametrize("width", [32, 96, 256])
+def test_coarse_products_are_within_their_steps(width: int, k: int, scale: float) -> None:
+    """Edges and weights are half a step off at most, and in a sum of `width` of them errors have no common sign."""
+    library = cpu.load()
+    if library is None:
+        pytest.skip("no C++ compiler and no shipped kernels")
+    generator = torch.Generator().manual_seed(width + k)
+    a, b = torch.randn(2, 60, width, generator=generator) * scale
+    a[0] = -1e3 * scale  # nothing is left of its edges
+    weight = torch.randn(width, width, generator=generator) / width**0.5
+    weight[1] = 0
+    index = torch.randint(60, (60, k), generator=generator, dtype=torch.int32)
+    packed, found = cpu.packed(library, weight, "edge_max_coarse"), torch.full((60, width), torch.nan)
+    library.straightpcf_edge_max_coarse(
+        cpu._at(a), cpu._at(b), cpu._at(index), cpu._at(packed), 60, k, width, width, cpu._at(found)
+    )
+    expected = ops.edge_max_torch(a[None], b[None], index[None].long(), weight)[0]
+    assert (found[0] == 0).all()
+    assert (found[:, 1] == 0).all()
+    assert float((found - expected).norm() / expected.norm()) < 1e-2
+    assert float((found - expected).abs().max()) < 0.05 * scale
