@@ -16,6 +16,7 @@ from straightpcf.model.normalize import (
     parts_of,
     patch_scales,
     zoom_of,
+    zoom_of_each,
     zoom_of_rest,
 )
 from straightpcf.model.patches import Patches
@@ -33,6 +34,8 @@ _AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
 # Where patches reach far, thin walls and bends are read as noise, so what is loud there is read once more, of more of
 # the points shown at half their size, in patches no larger than this.
 _NEAR = 0.15
+# Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
+_UNEVEN, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
 
 
@@ -45,7 +48,8 @@ class Reading:
     object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
     patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what the
     DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's points
-    have, or less; loud: whether an object has more noise than LOUD_NOISE, before the first pass.
+    have, or less; loud: whether an object has more noise than LOUD_NOISE, before the first pass; uneven: whether that
+    pass shows no patch larger than the noise in it asks for.
     """
 
     distance: float
@@ -58,6 +62,7 @@ class Reading:
     probed: Mapping[int, float] = field(default_factory=dict)
     usual: float = 0.0
     loud: bool = False
+    uneven: bool = False
 
 
 class NoiseReader:
@@ -86,7 +91,7 @@ class NoiseReader:
             probed = known if parts == (1,) else {}
             return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
         noise = self._noise_std(distances, scales)
-        zoom, parts, in_radii, loud = 1.0, (1,), 0.0, False
+        zoom, parts, in_radii, loud, uneven = 1.0, (1,), 0.0, False, False
         lie = Lie.of(here, probes, noise, each=self._processor.each) if first is None else first.lie
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
@@ -94,15 +99,23 @@ class NoiseReader:
             if first is None:
                 noise = self._read_again(here, tiling, noise)
                 zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
+                uneven = _is_uneven(self.noise_stds(distances, scales), zoom)
                 loud = noise > LOUD_NOISE and self._is_loud(here, tiling, noise, float(np.median(probes.radii)))
             elif first.loud and noise > _AGAIN_FROM * self._most:
                 zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
-        if parts != (1,):  # of other patches
-            return Reading(distance, noise, scene, lie, zoom, parts, in_radii, loud=loud)
+        if uneven or parts != (1,):  # patches are shown in other sizes, or are others
+            return Reading(distance, noise, scene, lie, zoom, parts, in_radii, loud=loud, uneven=uneven)
         if zoom != 1.0:
             distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
         return Reading(distance, noise, scene, lie, zoom, parts, in_radii, known, loud=loud)
+
+    def zooms(self, here: Floats, cut: Patches, shown: Reading) -> Floats | float:
+        """Return the factor by which a pass shows its patches larger: of each, (M,), or of all."""
+        if not shown.uneven:
+            return shown.zoom
+        scales = patch_scales(cut.radii, scene=False)
+        return zoom_of_each(self.noise_stds(self._processor.distances(here, cut, scales), scales), shown.zoom)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
@@ -175,6 +188,13 @@ class NoiseReader:
 
     def _noise_std(self, distances: Floats, scales: Floats) -> float:
         return float(np.median(self.noise_stds(distances, scales)))
+
+
+def _is_uneven(noise_stds: Floats, zoom: float) -> bool:
+    """Say of the noise stds of some patches whether noise, not only shape, differs, and some must be shown smaller."""
+    low, high = np.quantile(noise_stds, (0.1, 0.9))
+    loud = high > _UNEVEN * low and zoom_of_each(high, zoom) < zoom
+    return bool(loud) and len(noise_stds) >= _ENOUGH_PROBES
 
 
 def _parts(here: Floats, zoom: float) -> int:

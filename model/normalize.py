@@ -15,6 +15,7 @@ __all__ = [
     "parts_of",
     "patch_scales",
     "zoom_of",
+    "zoom_of_each",
     "zoom_of_rest",
 ]
 
@@ -91,6 +92,14 @@ def zoom_of(
     return float(np.clip(shown / noise_std, min(smallest, _BEARABLE_NOISE / noise_std), largest))
 
 
+def zoom_of_each(noise_stds: npt.NDArray[np.float64], zoom: float) -> npt.NDArray[np.float64]:
+    """Return the factors by which the first pass shows patches of noise stds (M,) larger: as `zoom_of`, `zoom` at most.
+
+    Where noise is not the same all over an object, its loud parts would be shown with more than the network bears.
+    """
+    return np.clip(_SHOWN_NOISE / np.maximum(noise_stds, 1e-9), _SMALLEST_ZOOM, zoom)
+
+
 def zoom_of_rest(noise_std: float, at_half_size: float) -> float:
     """Return the factor by which a later pass shows an object smaller, of which the first found more than LOUD_NOISE.
 
@@ -125,7 +134,9 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tu
     return (max(1, min(round(wanted), most)),)
 
 
-def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1.0) -> npt.NDArray[np.float64]:
+def patch_scales(
+    radii: npt.NDArray[np.float64], *, scene: bool, zoom: npt.NDArray[np.float64] | float = 1.0
+) -> npt.NDArray[np.float64]:
     """Return the factor that brings each patch of the unit-ball cloud to a size the network knows, (M,) float64.
 
     Patches of an object sampled like the training clouds are shown `zoom` times their size: at 1 this is the paper's
@@ -133,6 +144,6 @@ def patch_scales(radii: npt.NDArray[np.float64], *, scene: bool, zoom: float = 1
     nearest that was seen). Patches that would be smaller or larger than any in training are brought to these limits,
     the upper one zoomed. One of radius 0 keeps the factor 1.
     """
-    largest = max(1.0, zoom) * _LARGEST_RADIUS
+    largest = np.maximum(1.0, zoom) * _LARGEST_RADIUS
     wanted = np.clip(zoom * radii, _USUAL_RADIUS if scene else _SMALLEST_RADIUS, largest)
     return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

@@ -182,7 +182,7 @@ class Run:
         steps = [np.zeros_like(here) for _ in shown.parts[1:]]  # all but the last, which is settled as it comes
         # The patches are cut from `here`, so results may be written into self.moved as they come.
         for number, cut in self._cuts(here, tiling, shown.parts):
-            scales = patch_scales(cut.radii, scene=shown.scene, zoom=shown.zoom)
+            scales = patch_scales(cut.radii, scene=shown.scene, zoom=self.reader.zooms(here, cut, shown))
             probed, believed = shown.probed, None
             if shown.scene and self.filter.zoom:
                 probed, believed = self._believed(here, cut, scales)

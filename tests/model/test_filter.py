@@ -232,6 +232,18 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
     assert all(0.015 < noise < 0.03 for noise in seen)
 
 
+def test_a_part_with_more_noise_is_filtered_like_a_cloud_with_as_much(shipped: Filter) -> None:
+    clean = torus(12_000)
+    loud = clean[:, 0] > 0.3
+    noise = np.random.default_rng(1).standard_normal(clean.shape)
+    left = [
+        distance_to_torus(shipped.denoise(clean + std * noise, ONE_PASS).xyz)[loud]
+        for std in (np.where(loud, 0.03, 0.006)[:, None], 0.03)
+    ]
+    uneven, even = (float(np.sqrt(np.square(distances).mean())) for distances in left)
+    assert uneven < 1.2 * even
+
+
 @pytest.mark.parametrize("noise", [0.03, 0.05, 0.08])
 def test_more_noise_than_any_in_training_is_read_and_taken_away(shipped: Filter, noise: float) -> None:
     cloud = noisy(torus(8000), noise)

@@ -47,3 +47,49 @@ def test_noise_is_loud_where_it_is_read_so_far_around_and_near(far: float, near:
     assert reading.noise_std == pytest.approx(far)
     assert reading.loud is loud
     assert not reading.loud or reading.noise_std > LOUD_NOISE
+
+
+_WIDE = Calibration(noise=(0.0, 0.06))
+
+
+class SaysWhere(Says):
+    """Reads one noise std where x is above a limit, another where it is below."""
+
+    def __init__(self, loud: float, quiet: float, limit: float) -> None:
+        super().__init__(loud, quiet)
+        self.limit = limit
+
+    def distances(self, here: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
+        noise = np.where(here[cut.seeds, 0] > self.limit, self.far, self.near)
+        return np.minimum(noise * scales / _WIDE.noise[-1], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("loud", "quiet", "limit", "count", "uneven"),
+    [
+        (0.024, 0.008, 0.2, 20_000, True),
+        (0.024, 0.008, 0.5, 20_000, True),
+        (0.008, 0.008, 0.0, 20_000, False),
+        (0.024, 0.014, 0.0, 20_000, False),  # as much as walls differ from what is smooth
+        (0.024, 0.008, 0.95, 20_000, False),  # hardly anywhere
+        (0.009, 0.003, 0.0, 20_000, False),  # no patch is shown smaller for it
+        (0.024, 0.008, 0.0, 2000, False),  # too few patches to tell
+    ],
+)
+def test_noise_is_uneven_where_patches_differ_by_more_than_shape(
+    loud: float, quiet: float, limit: float, count: int, *, uneven: bool
+) -> None:
+    xyz = torus(count)
+    here = CloudFrame.of(xyz).enter(xyz)
+    reader = NoiseReader(SaysWhere(loud, quiet, limit), _WIDE, tile, zoom=True)  # type: ignore[arg-type]
+    tiling = tile(here)
+    reading = reader.read(here, tiling, None)
+    assert reading.uneven is uneven
+    (cut,) = tiling.cuts()
+    zooms = np.broadcast_to(reader.zooms(here, cut, reading), cut.seeds.shape)
+    noise = np.where(here[cut.seeds, 0] > limit, loud, quiet)
+    assert (zooms <= reading.zoom).all()
+    assert (zooms[noise == quiet] == reading.zoom).all()
+    if uneven:
+        np.testing.assert_allclose((zooms * noise)[noise == loud], min(0.03, reading.zoom * loud))
+        assert not reading.probed  # they were shown in another size
