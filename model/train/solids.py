@@ -52,13 +52,14 @@ def write_solids(
 
     With them their normals, `solid<number>/normals`, of the points at the finest of RESOLUTIONS. All in the frame where
     the bounding sphere has radius 1. resolutions: those of RESOLUTIONS to train on, all by default; without the finest,
-    that is `solid<number>/surface`. Raises ValueError for any other. kind: another one of KINDS, and its name.
+    that is `solid<number>/surface`. kind: another one of KINDS, and its name. Raises ValueError for others of either.
     """
     wanted = RESOLUTIONS if resolutions is None else resolutions
     if not wanted or not set(wanted) <= set(RESOLUTIONS):
         raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, wanted))}")
-    arrays = {}
-    families = KINDS[kind]
+    if kind not in KINDS:
+        raise ValueError(f"kinds are {', '.join(KINDS)}, not {kind}")
+    arrays, families = {}, KINDS[kind]
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         # Every family in turn: as many of each.
