@@ -53,6 +53,14 @@ def test_quality_of_every_pass(tmp_path: Path) -> None:
     assert len(cut["every"]) == 5
 
 
+def test_conditions() -> None:
+    said = printed("conditions", "half-1-3", "cut", "--shapes", "sphere", "--resolution", 1500, "--threads", 1)
+    half, _, cut, mean = said.splitlines()
+    assert "louder" in half
+    assert cut.split(maxsplit=4)[-1] == mean.split(maxsplit=2)[-1]
+    assert "WORSE" not in said
+
+
 def test_speed() -> None:
     said = printed("speed", "--shape", "sphere", "--resolution", 1500, "--patches", 1, "--threads", 1)
     ours, theirs = (
