@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from straightpcf.model.normalize import CloudFrame
 __all__ = ["CONDITIONS", "Condition"]
 
 Floats = npt.NDArray[np.float64]
-SURFACE = 50_000  # points that stand for a surface
+SURFACE = 50_000  # points that stand for an analytic surface, as for an archive's
 _BEAM = np.array([0.3, 0.5, 0.81])  # where a scanner looks from
 
 
@@ -54,47 +54,43 @@ def main() -> None:
     if unknown := set(arguments.conditions) - set(CONDITIONS):
         parser.error(f"no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")
     model = load_filter(device="cpu", threads=arguments.threads)
-    surfaces = dict(_surfaces(arguments.archive, arguments.shapes, arguments.resolution))
+    truths = dict(_truths(arguments.archive, arguments.shapes, arguments.resolution))
     for name in arguments.conditions or CONDITIONS:
         rows = []
-        for shape, (clean, surface) in surfaces.items():
+        for shape, truth in truths.items():
             for seed in arguments.seeds:
-                condition = CONDITIONS[name](np.random.default_rng([seed, *name.encode()]), clean)
-                rows.append(row := _measured(model, condition, Truth.of(condition.clean, surface)))
+                condition = CONDITIONS[name](np.random.default_rng([seed, *name.encode()]), truth.clean)
+                rows.append(row := _measured(model, condition, truth))
                 print(f"{name:12} {shape:14} seed {seed}  {_said(row)}", flush=True)
         print(f"{name:12} {'mean':14}         {_said(np.exp(np.log(rows).mean(axis=0)))}", flush=True)
 
 
 def _said(row: Floats) -> str:
-    before, after, loud_before, loud_after = row.reshape(4, -1)
+    before, after, louder = row.reshape(3, 2)
     worse = "  WORSE" if (after > before).any() else ""
-    loud = f", louder {loud_before[1]:.3f} -> {loud_after[1]:.3f}" if np.isfinite(loud_after[1]) else ""
+    loud = f", louder {louder[0]:.3f} -> {louder[1]:.3f}" if np.isfinite(louder).all() else ""
     return f"{before[0]:.3f} / {before[1]:.3f} -> {after[0]:.3f} / {after[1]:.3f}{loud}{worse}"
 
 
 def _measured(model: Filter, condition: Condition, truth: Truth) -> Floats:
-    """Return CD and squared height before and after, of all points, and height of the louder ones, (8,)."""
+    """Return CD and squared height before, both after, and the louder points' height before and after, (6,)."""
+    truth, loud = replace(truth, clean=condition.clean), condition.loud
     clouds = [condition.noisy, model.denoise(condition.noisy).xyz]
-    found = [truth.measures(xyz)[:2] for xyz in clouds]
-    loud = condition.loud
-    found += [(np.nan, np.nan) if loud is None else truth.measures(xyz[loud])[:2] for xyz in clouds]
-    return np.array(found).ravel()
+    found = [value for xyz in clouds for value in truth.measures(xyz)[:2]]
+    louder = [np.nan if loud is None else 1e4 * np.square(truth.heights(xyz[loud])[0]).mean() for xyz in clouds]
+    return np.array([*found, *louder])
 
 
-def _surfaces(
-    archive: Path | None, shapes: list[str] | None, resolution: int
-) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
-    """Yield each shape's clean cloud and the points that stand for its surface, in its unit-ball frame."""
+def _truths(archive: Path | None, shapes: list[str] | None, resolution: int) -> Iterator[tuple[str, Truth]]:
+    """Yield each shape, in the unit-ball frame of the points that stand for its surface."""
     if archive is None:
         for coarse, fine in zip(analytic(resolution, shapes), analytic(SURFACE, shapes), strict=True):
             frame = CloudFrame.of(fine.clean)
-            yield coarse.name, (frame.enter(coarse.clean), frame.enter(fine.clean))
+            yield coarse.name, Truth.of(frame.enter(coarse.clean), frame.enter(fine.clean))
         return
     with np.load(archive, allow_pickle=False) as file:
         for shape in sorted(shapes or {name.split("/")[0] for name in file.files}):
-            surface = file[f"{shape}/{SURFACE}"].astype(np.float64)
-            frame = CloudFrame.of(surface)
-            yield shape, (frame.enter(file[f"{shape}/{resolution}"].astype(np.float64)), frame.enter(surface))
+            yield shape, Truth.read(file, shape, resolution)
 
 
 def _along(clean: Floats) -> Floats:

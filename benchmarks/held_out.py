@@ -25,7 +25,6 @@ from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
-from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network, take_distance_module
 from straightpcf.points.options import DenoiseOptions
@@ -72,10 +71,7 @@ def _truths(arguments: argparse.Namespace) -> Iterator[tuple[str, Truth]]:
             every = {name.split("/")[0] for name in archive.files}
             held_out = held_out_shapes(archive.files) if path == arguments.data else every
             for shape in sorted(held_out if arguments.shapes is None else held_out.intersection(arguments.shapes)):
-                surface = archive[f"{shape}/50000"].astype(np.float64)
-                frame = CloudFrame.of(surface)
-                clean = frame.enter(archive[f"{shape}/{arguments.resolution}"].astype(np.float64))
-                yield shape, Truth.of(clean, frame.enter(surface))
+                yield shape, Truth.read(archive, shape, arguments.resolution)
 
 
 def _filter(path: Path, threads: int | None) -> Filter:

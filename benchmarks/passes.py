@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,10 +52,21 @@ class Truth:
         normals *= np.where(sag < 0, -1.0, 1.0)[:, None]
         return cls(clean, tree, normals, 4 * np.abs(sag) / reach[:, -1] ** 2)
 
+    @classmethod
+    def read(cls, archive: Mapping[str, npt.NDArray[np.float32]], shape: str, resolution: int) -> Truth:
+        """Read a shape of an archive that training takes, in the unit-ball frame of the 50K points of its surface."""
+        surface = archive[f"{shape}/50000"].astype(np.float64)
+        frame = CloudFrame.of(surface)
+        return cls.of(frame.enter(archive[f"{shape}/{resolution}"].astype(np.float64)), frame.enter(surface))
+
+    def heights(self, xyz: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+        """Return how high over the surface points (N, 3) are, and the surface's points below them, both (N,)."""
+        _, foot = self.tree.query(xyz)
+        return ((xyz - self.tree.data[foot]) * self.normals[foot]).sum(axis=1), foot
+
     def measures(self, xyz: npt.NDArray[np.float64]) -> tuple[float, float, float]:
         """Return CD, across and sunk of a filtered cloud (N, 3), x1e4."""
-        _, foot = self.tree.query(xyz)
-        height = ((xyz - self.tree.data[foot]) * self.normals[foot]).sum(axis=1)
+        height, foot = self.heights(xyz)
         order = np.argsort(self.curvature[foot], kind="stable")
         sunk = np.mean([part.mean() ** 2 for part in np.array_split(height[order], _TENTHS)])
         return 1e4 * chamfer_distance(xyz, self.clean), float(1e4 * np.mean(height**2)), float(1e4 * sunk)

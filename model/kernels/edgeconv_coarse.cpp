@@ -114,6 +114,7 @@ struct Packed {
 
 extern "C" {
 
+// W (out_width, width), both multiples of 32 -> packed for edge_max_coarse. Size: width * out_width floats.
 void straightpcf_pack_coarse(const float* weight, int width, int out_width, float* packed) {
   const Packed to(packed, width, out_width);
   for (int c = 0; c < out_width; ++c) {
@@ -133,6 +134,7 @@ void straightpcf_pack_coarse(const float* weight, int width, int out_width, floa
   }
 }
 
+// As straightpcf_edge_max, without the winning edges.
 void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
                                  int k, int width, int out_width, float* out) {
   std::vector<float> scratch((size_t)width * (k / sizeof(float) + 2) + k + 16);
@@ -163,12 +165,10 @@ void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* 
 
 extern "C" {
 
-// W (out_width, width), both multiples of 32 -> packed for edge_max_coarse. Size: width * out_width floats.
 void straightpcf_pack_coarse(const float* weight, int width, int out_width, float* packed) {
   straightpcf_pack(weight, width, out_width, packed);
 }
 
-// As straightpcf_edge_max, without the winning edges.
 void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
                                  int k, int width, int out_width, float* out) {
   straightpcf_edge_max(a, b, index, packed, rows, k, width, out_width, out, nullptr);
