@@ -1,6 +1,8 @@
 """Time the compiled loops against their plain torch twins: `python -m benchmarks.kernels [--device cuda]`.
 
-On a CPU one thread and 4 patches, on a device the batch of 32 that the filter gives it.
+On a CPU one thread and 4 patches, on a device the batch of 32 that the filter gives it. `--every-set` times a
+VelocityModule with the kernels of each instruction set that the processor has, for all points of a patch and for a
+third of them, as most evaluations of the filter are.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable
 from functools import partial
+from unittest import mock
 
 import torch
 
@@ -19,13 +22,16 @@ from straightpcf.model.kernels import cpu
 from straightpcf.model.nets.straightpcf import VelocityModule
 
 POINTS, NEIGHBOURS = 1000, 32
+OWNED = 334  # of a patch's points at 3-fold coverage
 
 
 def main() -> None:
     """Print a row per operation."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels")
     parser.add_argument("--device", default="cpu", help='"cpu" (the default) or "cuda"')
-    device = parser.parse_args().device
+    parser.add_argument("--every-set", action="store_true", help="the CPU's instruction sets, one by one, instead")
+    arguments = parser.parse_args()
+    device = arguments.device
     patches = 4 if device == "cpu" else 32
 
     def milliseconds(function: Callable[..., object], *arguments: object, repeats: int = 7) -> float:
@@ -44,6 +50,17 @@ def main() -> None:
     keep_large_buffers()
     torch.set_default_device(device)
     generator = torch.Generator(device).manual_seed(0)
+    patch = torch.randn(patches, POINTS, 3, generator=generator) * 0.2
+    if arguments.every_set:
+        print(f"{'VelocityModule, ms':24} {POINTS:>8} {OWNED:>8}")
+        for name in cpu.instruction_sets():
+            with mock.patch.object(cpu, "instruction_sets", lambda name=name: (name,)), torch.no_grad():
+                cpu.load.cache_clear()
+                module = VelocityModule().eval()
+                every, owned = (milliseconds(module, patch, rows) for rows in (None, OWNED))
+            print(f"{name:24} {every:8.1f} {owned:8.1f}", flush=True)
+        cpu.load.cache_clear()
+        return
     where = torch.cuda.get_device_name(device) if device != "cpu" else f"{cpu.instruction_sets()[0]}, 1 thread"
     print(f"{where}, {POINTS} points, k = {NEIGHBOURS}, ms per patch")
     print(f"{'':24} {'kernel':>8} {'torch':>8} {'GFLOP/s':>8}")
@@ -64,9 +81,10 @@ def main() -> None:
         ours = milliseconds(partial(torch.autograd.grad, retain_graph=True), out, (a, b, weight), grad)
         print(f"  its gradient {ours:18.2f}")
     module = VelocityModule().eval()
-    with torch.inference_mode():
-        x = torch.randn(patches, POINTS, 3, generator=generator) * 0.2
-        print(f"VelocityModule {milliseconds(module, x):18.2f}")
+    with torch.no_grad():
+        every, owned = (milliseconds(module, patch, rows) for rows in (None, OWNED))
+    print(f"VelocityModule {every:18.2f}")
+    print(f"  {OWNED} of the points {owned:12.2f}")
 
 
 if __name__ == "__main__":

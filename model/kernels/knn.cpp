@@ -9,21 +9,46 @@ namespace {
 constexpr float FAR = 3.4e38f;  // of padding and of the query itself: never chosen
 constexpr int GROUPS = 64;  // disjoint, of a patch filled up to a multiple of them: see `select`
 
-// Squared distances of ROWS queries to all points; `columns` is the patch transposed, (dims, padded).
-inline void distances(const float* columns, int padded, const float* queries, int dims, float* out) {
-  for (int j = 0; j < padded; j += COLS * LANES) {
+constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
+
+constexpr int PANEL = COLS * LANES;  // points that are read together, a coordinate after the other: (dims, PANEL)
+
+// Squared distances of ROWS queries to all points; `panels` is the patch, (padded / PANEL, dims, PANEL).
+inline void distances(const float* panels, int padded, const float* queries, int dims, float* out) {
+  for (int j = 0; j < padded; j += PANEL, panels += (size_t)dims * PANEL) {
     vec sum[ROWS][COLS];
     for (int q = 0; q < ROWS; ++q)
       for (int c = 0; c < COLS; ++c) sum[q][c] = vec{};
     for (int d = 0; d < dims; ++d) {
       vec x[COLS];
-      for (int c = 0; c < COLS; ++c) x[c] = load(columns + (size_t)d * padded + j + c * LANES);
+      for (int c = 0; c < COLS; ++c) x[c] = load(panels + (size_t)d * PANEL + c * LANES);
       for (int q = 0; q < ROWS; ++q) {
         const vec from = splat(queries[(size_t)q * dims + d]);
         for (int c = 0; c < COLS; ++c) {
           const vec apart = x[c] - from;
           sum[q][c] += apart * apart;
         }
+      }
+    }
+    for (int q = 0; q < ROWS; ++q)
+      for (int c = 0; c < COLS; ++c) store(out + (size_t)q * padded + j + c * LANES, sum[q][c]);
+  }
+}
+
+// The same by products, |q|^2 + |p|^2 - 2 q p, half as many operations. `queries` are of -2 q here, and `squares` are of
+// all points, those of the queries from `first` on. Rounding may leave what is nearly nothing below it.
+inline void distances_by_products(const float* panels, const float* squares, int first, int padded,
+                                  const float* queries, int dims, float* out) {
+  for (int j = 0; j < padded; j += PANEL, panels += (size_t)dims * PANEL) {
+    vec sum[ROWS][COLS];
+    for (int q = 0; q < ROWS; ++q)
+      for (int c = 0; c < COLS; ++c) sum[q][c] = load(squares + j + c * LANES) + squares[first + q];
+    for (int d = 0; d < dims; ++d) {
+      vec x[COLS];
+      for (int c = 0; c < COLS; ++c) x[c] = load(panels + (size_t)d * PANEL + c * LANES);
+      for (int q = 0; q < ROWS; ++q) {
+        const vec query = splat(queries[(size_t)q * dims + d]);
+        for (int c = 0; c < COLS; ++c) sum[q][c] += x[c] * query;
       }
     }
     for (int q = 0; q < ROWS; ++q)
@@ -140,7 +165,7 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   int count = 0;
   for (int j = 0; j < padded; ++j)
     if (distance[j] <= bound && distance[j] < FAR)
-      near.keys[count++] = (uint64_t(bits_of(distance[j])) << 32) | uint32_t(j);
+      near.keys[count++] = (uint64_t(bits_of(std::max(distance[j], 0.0f))) << 32) | uint32_t(j);
   const auto begin = near.keys.begin();
   if (count > k) std::nth_element(begin, begin + k, begin + count);
   else std::sort(begin, begin + count);
@@ -151,9 +176,7 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
 
 #if defined(__AMX_BF16__)
 
-constexpr int MANY_DIMS = 16;  // from here on differences cost more than products
-
-// Squared distances in many dimensions by products, |q|^2 + |p|^2 - 2 q p, on tiles. A coordinate is the sum of two
+// Squared distances in many dimensions by products, on tiles. A coordinate is the sum of two
 // bf16, `high` and `low`, of whose products low times low is left out: 2^-16 of |q| |p|. Squares are sums of three.
 class Products {
  public:
@@ -253,14 +276,24 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
     return;
   }
 #endif
-  std::vector<float> columns((size_t)dims * padded, 0.0f), distance((size_t)ROWS * padded);
-  std::vector<float> queries((size_t)ROWS * dims);
+  const bool many = dims >= MANY_DIMS;
+  std::vector<float> mean(dims, 0.0f), squares(padded, 0.0f);
+  for (int i = 0; many && i < count; ++i)  // squares of what all have in common would swallow the rest
+    for (int d = 0; d < dims; ++d) mean[d] += points[(size_t)i * dims + d] / count;
+  std::vector<float> panels((size_t)padded * dims, 0.0f), from((size_t)padded * dims, 0.0f);
   for (int i = 0; i < count; ++i)
-    for (int d = 0; d < dims; ++d) columns[(size_t)d * padded + i] = points[(size_t)i * dims + d];
+    for (int d = 0; d < dims; ++d) {
+      const float x = points[(size_t)i * dims + d] - mean[d];
+      squares[i] += x * x;
+      panels[((size_t)(i / PANEL) * dims + d) * PANEL + i % PANEL] = x;
+      from[(size_t)i * dims + d] = many ? -2 * x : x;
+    }
+  std::vector<float> distance((size_t)ROWS * padded);
   for (int first = 0; first < rows; first += ROWS) {
     const int block = std::min(ROWS, rows - first);
-    std::memcpy(queries.data(), points + (size_t)first * dims, (size_t)block * dims * sizeof(float));
-    distances(columns.data(), padded, queries.data(), dims, distance.data());
+    const float* queries = &from[(size_t)first * dims];
+    if (many) distances_by_products(panels.data(), squares.data(), first, padded, queries, dims, distance.data());
+    else distances(panels.data(), padded, queries, dims, distance.data());
     for (int q = 0; q < block; ++q) {
       float* row = &distance[(size_t)q * padded];
       std::fill(row + count, row + padded, FAR);
