@@ -41,7 +41,7 @@ def place_named(path: str | Path) -> Iterator[None]:
 def replaced_when_complete(path: Path) -> Iterator[Path]:
     """Lend an empty file beside `path`, which takes its place if the block ends well, else it vanishes.
 
-    A file that is replaced hands on its mode, and a symbolic link stays one: what it points to is replaced.
+    It is on the disk before it does: what it replaces may be all that is left of a result. A file that is replaced hands on its mode, and a symbolic link stays one: what it points to is replaced.
     """
     check_target(path)
     target = _target(path)
@@ -52,11 +52,24 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
     try:
         with place_named(path):
             yield unfinished
+            with unfinished.open("rb+") as file:
+                os.fsync(file.fileno())
         if mode is not None:
             unfinished.chmod(mode)
         unfinished.replace(target)
+        _sync_folder(target.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    if os.name != "posix":  # Windows opens no folders
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _target(path: Path) -> Path:

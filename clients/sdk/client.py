@@ -32,7 +32,8 @@ class Client:
     heeded over HTTP.
     timeout: seconds of silence that are borne, None for any; of streams (events, patches, progress) at least 60.
     max_retries: of a busy server and of a broken connection; every other error is raised at once. A server that has
-    answered and is gone (it is restarted) is asked on for `timeout` seconds, but by what uploads a file; 0: never.
+    answered and is gone (it is restarted, and a proxy before it answers 502, 503 or 504) is asked on for `timeout`
+    seconds, but by what uploads a file; 0: never.
     """
 
     def __init__(

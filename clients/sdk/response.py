@@ -22,6 +22,7 @@ from straightpcf.points.errors import (
 
 __all__ = ["Health", "ServerInfo", "failed_connection", "failed_response", "parse_health", "parse_info"]
 
+_GATEWAY = (502, 503, 504)  # of a proxy, whose server is gone or restarted: what ours says of itself has a code
 # A request that may have reached the server is sent again only because every one of ours is idempotent.
 _RETRYABLE_FAULTS = (httpx2.NetworkError, httpx2.TimeoutException, httpx2.RemoteProtocolError, httpx2.SSEError)
 
@@ -74,7 +75,7 @@ def failed_response(response: httpx2.Response) -> Failure:
         detail += f" to {place[:200]}: give the address that it ends at"
     return Failure(
         error=kind(detail, request_id=request_id),
-        retryable=bool(problem.get("retryable", response.status_code in (429, 503))),
+        retryable=bool(problem.get("retryable", response.status_code in (429, *_GATEWAY))),
         retry_after=_seconds(response.headers),
     )
 
@@ -96,8 +97,10 @@ def _problem(response: httpx2.Response) -> dict[str, Any]:
 def _kind_of_status(status: int) -> type[StraightPCFError]:
     if status == 413:
         return TooManyBytes
-    if status in (429, 503):
+    if status == 429:
         return ServerBusy
+    if status in _GATEWAY:
+        return ConnectionFailed
     return InvalidRequest if 300 <= status < 500 else InternalError
 
 

@@ -71,7 +71,9 @@ class Denoised:
     def xyz(self) -> npt.NDArray[np.floating[Any]]:
         """The positions, (N, 3): of the array's own dtype if an array was sent, else float64."""
         if self.filename.endswith(".npy"):
-            return np.asarray(np.load(io.BytesIO(self.read()), allow_pickle=False))[:, :3]
+            array = np.asarray(np.load(io.BytesIO(self.read()), allow_pickle=False))
+            if array.dtype.names is None:  # else a table of records
+                return array[:, :3]
         from straightpcf.points.formats import read_cloud
 
         if self.path is not None:

@@ -87,3 +87,17 @@ def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
                 act(path)
     assert fifo.is_fifo()
     assert list(tmp_path.iterdir()) == [fifo]
+
+
+def test_it_is_on_the_disk_before_it_takes_a_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path := tmp_path / "a.ply").write_bytes(b"old")
+    synced: list[tuple[bool, bytes]] = []
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        real(handle)
+        synced.append((stat.S_ISDIR(os.fstat(handle).st_mode), path.read_bytes()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write(path, b"new")
+    assert synced == [(False, b"old"), (True, b"new")]

@@ -95,6 +95,15 @@ def test_positions_of_an_array_of_more_columns_are_three(client: Client, tmp_pat
     assert client.denoise(path, iterations=1).xyz.shape == (POINTS, 3)
 
 
+def test_positions_of_records_are_their_x_y_and_z(client: Client, tmp_path: Path) -> None:
+    records = np.zeros(POINTS, [("intensity", "<f4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    records["x"], records["y"], records["z"] = noisy(torus(POINTS), 0.01).T
+    np.save(path := tmp_path / "records.npy", records)
+    result = client.denoise(path, tmp_path / "clean.npy", iterations=1)
+    clean = np.load(tmp_path / "clean.npy")
+    np.testing.assert_array_equal(result.xyz, np.stack([clean["x"], clean["y"], clean["z"]], axis=1))
+
+
 def test_path_bytes_and_array_give_the_same_points(client: Client, scan: Path, tmp_path: Path) -> None:
     target = tmp_path / "clean.npy"
     by_path = client.denoise(scan, target, iterations=1)
@@ -257,6 +266,20 @@ def test_a_server_that_answered_and_is_gone_is_asked_on(monkeypatch: pytest.Monk
         assert len(heads) == 2
 
 
+@pytest.mark.parametrize("status", ["502 Bad Gateway", "503 Service Unavailable", "504 Gateway Timeout"])
+def test_a_proxy_whose_server_is_gone_is_asked_on(status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    gone = canned(status, "<html>proxy</html>")
+    with answering(HEALTHY, *[gone] * 3, HEALTHY) as (url, heads), Client(url, max_retries=1) as client:
+        assert client.health().ready
+        assert client.health().ready
+        assert len(heads) == 5
+    with answering(gone, gone) as (url, heads), Client(url, max_retries=1) as client:
+        with pytest.raises(ConnectionFailed, match=status):
+            client.health()
+        assert len(heads) == 2
+
+
 def test_it_is_asked_for_no_longer_than_silence_is_borne_and_uploads_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -282,7 +305,7 @@ def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_error_that_would_only_come_again_is_not_retried() -> None:
     missing = canned("503 Service Unavailable", '{"code":"device_unavailable","retryable":false}')
-    for answer, kind in ((missing, Exception), (canned("502 Bad Gateway", "<html>proxy</html>"), InternalError)):
+    for answer, kind in ((missing, Exception), (canned("500 Oh No", "<html>proxy</html>"), InternalError)):
         with answering(answer) as (url, heads), Client(url) as client:
             with pytest.raises(kind):
                 client.health()
