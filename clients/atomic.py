@@ -41,7 +41,8 @@ def place_named(path: str | Path) -> Iterator[None]:
 def replaced_when_complete(path: Path) -> Iterator[Path]:
     """Lend an empty file beside `path`, which takes its place if the block ends well, else it vanishes.
 
-    It is on the disk before it does: what it replaces may be all that is left of a result. A file that is replaced hands on its mode, and a symbolic link stays one: what it points to is replaced.
+    It is on the disk before it does: what it replaces may be all that is left of a result. A file that is replaced
+    hands on its mode, and a symbolic link stays one: what it points to is replaced.
     """
     check_target(path)
     target = _target(path)

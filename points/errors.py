@@ -209,6 +209,12 @@ class MisdirectedRequest(StraightPCFError):  # noqa: N818
     code = "misdirected_request"
 
 
+class CrossOrigin(StraightPCFError):  # noqa: N818
+    """Report what a page of another origin would have a server without keys do."""
+
+    code = "cross_origin"
+
+
 class RequestTimeout(StraightPCFError):  # noqa: N818
     """Report a body that stopped coming in before its end."""
 

@@ -81,12 +81,13 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.state.engine = engine
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
+    origins = tuple(origin.strip() for origin in settings.cors_origins.split(",") if origin.strip())
     if gate.open and is_loopback(settings.host):
         hosts = tuple(host.strip().lower() for host in settings.allowed_hosts.split(",") if host.strip())
-        app.add_middleware(HostMiddleware, hosts=hosts)
+        app.add_middleware(HostMiddleware, hosts=hosts, origins=origins)
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
-    if origins := [origin.strip() for origin in settings.cors_origins.split(",") if origin.strip()]:
+    if origins:
         app.add_middleware(
             CORSMiddleware, allow_origins=origins, allow_methods=["*"], allow_headers=["*"], expose_headers=["*"]
         )

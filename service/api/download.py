@@ -49,10 +49,10 @@ def result_response(
     headers["Content-Disposition"] = disposition(record.result.filename)
     parts: list[str] = []
     if request.method in _CONDITIONAL:
-        if not _names(request.headers.get("if-match", "*"), headers["ETag"], weakly=False):
+        if not _names(_listed(request, "if-match", absent="*"), headers["ETag"], weakly=False):
             file.close()
             raise PreconditionFailed(f"the result is {headers['ETag']}, which If-Match does not name")
-        if _names(request.headers.get("if-none-match", ""), headers["ETag"], weakly=True):
+        if _names(_listed(request, "if-none-match"), headers["ETag"], weakly=True):
             file.close()
             same = {name: headers[name] for name in ("ETag", "Cache-Control")}  # RFC 9110, 15.4.5
             return Response(status_code=304, headers=same, background=after)
@@ -127,6 +127,11 @@ def report_and_file(file: IO[bytes], record: JobRecord, *, after: BackgroundTask
     return StreamingResponse(
         body(), media_type=f"multipart/mixed; boundary={boundary}", headers=headers, background=after
     )
+
+
+def _listed(request: Request, name: str, *, absent: str = "") -> str:
+    """Return a header whose value is a list: of several lines, one (RFC 9110, 5.3)."""
+    return ",".join(request.headers.getlist(name) or [absent])
 
 
 def _names(header: str, etag: str, *, weakly: bool) -> bool:

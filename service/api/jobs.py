@@ -114,7 +114,7 @@ async def job_events(
 
 @router.post(
     "/jobs/{id}/cancel", status_code=202, response_model=Job, summary="Cancel a job",
-    responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 404, 507)},
+    responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 403, 404, 507)},
 )  # fmt: skip
 async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
     """Cancel a job that waits or runs; its worker is free within a second."""
@@ -124,7 +124,7 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
     return job_response(after, 200 if before.finished else 202)
 
 
-@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 404, 507), summary="Delete a job")
+@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")
 async def delete_job(id: str, request: Request, owner: Owner) -> None:
     """Remove a job, its files and its events, whatever its state."""
     engine: Engine = request.app.state.engine
@@ -166,7 +166,7 @@ async def job_stream(id: str, request: Request, owner: Owner) -> Response:
         await engine.result(id, owner=owner)  # raises what is to be said
     if record.error is not None:
         raise record.error
-    accept = request.headers.get("accept", "*/*")
+    accept = ",".join(request.headers.getlist("accept"))
     if len(accept) > 1000:
         raise InvalidRequest(f"Accept has {len(accept)} characters")
     return patch_stream(engine, id, owner, as_json=asks_for(accept, NDJSON_MEDIA_TYPE))

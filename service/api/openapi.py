@@ -194,6 +194,7 @@ def _problem(description: str) -> dict[str, Any]:
 _PROBLEMS = {
     400: "The request itself is broken (`invalid_request`).",
     401: "No API key, or an unknown one (`unauthorized`).",
+    403: "This server has no keys and does nothing for pages of that origin (`cross_origin`).",
     404: "There is no such job, or not for this key (`not_found`).",
     408: "The body stopped coming (`request_timeout`).",
     409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
@@ -229,7 +230,7 @@ def document_problems(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-_INTAKE = (400, 401, 408, 409, 413, 415, 422, 429, 500, 503, 507)
+_INTAKE = (400, 401, 403, 408, 409, 413, 415, 422, 429, 500, 503, 507)
 _JOB: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
 _LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type": "string"}}}
 

@@ -68,7 +68,7 @@ async def denoise(request: Request, owner: Owner) -> Response:
     engine: Engine = request.app.state.engine
     prefer = parse_prefer(request.headers.getlist("prefer"))
     record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
-    if asks_for(request.headers.get("accept", ""), SSE_MEDIA_TYPE):
+    if asks_for(",".join(request.headers.getlist("accept")), SSE_MEDIA_TYPE):
         return event_stream(engine, record.id, owner, headers={"Location": f"/jobs/{record.id}"})
     if prefer.respond_async and prefer.wait is None:
         return job_response(record, 202, prefer.applied(finished=False))

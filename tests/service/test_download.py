@@ -78,6 +78,13 @@ def test_if_match_sends_no_other_result_than_the_one_that_is_named(http: httpx2.
         assert http.head(result, headers={"If-Match": named}).status_code == 412
 
 
+def test_conditions_on_several_lines_are_one_list(http: httpx2.Client, result: str) -> None:
+    etag = http.get(result).headers["etag"]
+    for name, status in (("If-Match", 200), ("If-None-Match", 304)):
+        assert http.get(result, headers=[(name, '"other"'), (name, etag)]).status_code == status, name
+    assert http.get(result, headers={"If-Match": ""}).status_code == 412
+
+
 def test_an_answer_without_a_body_says_how_to_cache(http: httpx2.Client, result: str) -> None:
     whole = http.get(result)
     for named in (whole.headers["etag"], f"W/{whole.headers['etag']}", "*"):

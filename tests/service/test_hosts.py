@@ -1,4 +1,4 @@
-"""Whose names a server answers for: by DNS rebinding a web page would speak to it under its own."""
+"""Whose names a server answers for, and whose pages: by DNS rebinding one would speak to it under its own name."""
 
 from __future__ import annotations
 
@@ -70,3 +70,55 @@ def test_hosts_that_are_named_are_answered(tmp_path: Path) -> None:
 def test_a_server_with_keys_or_on_another_address_answers_for_any(tmp_path: Path) -> None:
     assert not refused(asked(tmp_path / "keys", OTHER, api_keys="alpha"))
     assert not refused(asked(tmp_path / "open", OTHER, host="0.0.0.0"))
+
+
+OWN_PAGES = ["http://localhost:8000", "https://127.0.0.1", "http://[::1]:1", "http://a.localhost:3000"]
+OTHER_PAGES = [
+    "http://evil.example",
+    "https://evil.example:8000",
+    "http://localhost.evil.example",
+    "null",
+    "http://[::",
+]
+
+
+async def posted(host: str, port: int, origin: str, method: str = "POST", path: str = "/jobs") -> bytes:
+    reader, writer = await asyncio.open_connection(host, port)
+    head = f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nOrigin: {origin}\r\n"
+    writer.write(f"{head}Content-Length: 6\r\nContent-Disposition: attachment; filename=a.xyz\r\n\r\n1 2 3\n".encode())
+    answer = await reader.read()
+    writer.close()
+    return answer
+
+
+def turned_away(folder: Path, *, method: str = "POST", path: str = "/jobs", **settings: Any) -> list[str]:
+    """Return the pages for which a server does nothing."""
+    answers = {}
+
+    async def scenario() -> None:
+        async with serving(folder, willing(), **settings) as (_, host, port):
+            for origin in OWN_PAGES + OTHER_PAGES:
+                answers[origin] = await posted(host, port, origin, method, path)
+
+    play(scenario)
+    refused = {origin: answer for origin, answer in answers.items() if answer.startswith(b"HTTP/1.1 403 ")}
+    assert all(b'"code":"cross_origin"' in answer for answer in refused.values())
+    return [*refused]
+
+
+@pytest.mark.parametrize(("method", "path"), [("POST", "/jobs"), ("POST", "/denoise"), ("DELETE", "/jobs/a")])
+def test_a_server_without_keys_on_loopback_does_nothing_for_other_hosts_pages(
+    tmp_path: Path, method: str, path: str
+) -> None:
+    assert turned_away(tmp_path, method=method, path=path) == OTHER_PAGES
+
+
+def test_pages_that_are_named_may_have_work_done(tmp_path: Path) -> None:
+    named = turned_away(tmp_path / "named", cors_origins="http://evil.example", allowed_hosts="localhost.evil.example")
+    assert named == [page for page in OTHER_PAGES if page not in ("http://evil.example", OTHER_PAGES[2])]
+    assert not turned_away(tmp_path / "all", cors_origins="*")
+
+
+def test_looking_is_left_to_the_browser_and_keys_keep_pages_out(tmp_path: Path) -> None:
+    assert not turned_away(tmp_path / "get", method="GET", path="/v1/info")
+    assert not turned_away(tmp_path / "keys", api_keys="alpha")
