@@ -19,16 +19,18 @@ from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 __all__ = ["INPUT", "JobFolders", "digest_of"]
 
 INPUT = "input"
+_MODE = 0o700  # other users of the machine have no key either
 _ORPHAN_SECONDS = 3600.0  # an upload, folder or lock that nobody owns is given up after this
 
 
 class JobFolders:
-    """Own `<data_dir>/jobs`, `incoming` and `servers`; several servers may share them."""
+    """Own `<data_dir>/jobs`, `incoming` and `servers`; several servers of one user may share them."""
 
     def __init__(self, data_dir: Path) -> None:
         self._jobs, self._incoming, self._servers = (data_dir / name for name in ("jobs", "incoming", "servers"))
+        data_dir.mkdir(mode=_MODE, parents=True, exist_ok=True)
         for folder in (self._jobs, self._incoming, self._servers):
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=_MODE, exist_ok=True)
         self.server = uuid.uuid4().hex
         self._lock: IO[bytes] = self._lock_path(self.server).open("wb")
         fcntl.flock(self._lock, fcntl.LOCK_EX)

@@ -10,7 +10,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,6 +44,7 @@ __all__ = ["JobStore"]
 
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+_PASSING: tuple[EventKind, ...] = ("preview", "progress")
 Hold = Literal["held", "canceled", "lost"]
 _FENCES = 2**32  # of one row: those of rows are apart, so that no fence comes back with an id that is used again
 _PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
@@ -257,15 +258,23 @@ class JobStore:
         return [row["folder"] for row in self._db.execute(query, (time.time(),))]
 
     def expire(self, *, rows_after: float) -> list[str]:
-        """Mark what is over its time, forget what has been so for rows_after seconds; return folders to remove."""
+        """Mark what is over its time, forget what has been so for rows_after seconds; return folders to remove.
+
+        What a job showed on its way goes with its files: previews are a hundred times its row. The room is given back.
+        """
         with self._transaction():
             now = time.time()
             query = (
-                f"UPDATE jobs SET state = 'expired' WHERE state IN {_finished()} AND expires_at < ? RETURNING folder"
+                f"UPDATE jobs SET state = 'expired' WHERE state IN {_finished()} AND expires_at < ?"
+                " RETURNING seq, folder"
             )
-            expired = [row["folder"] for row in self._db.execute(query, (now,)).fetchall()]
+            expired = self._db.execute(query, (now,)).fetchall()
+            query = f"DELETE FROM events WHERE job = ? AND kind IN {_PASSING}"
+            self._db.executemany(query, [(row["seq"],) for row in expired])
             self._db.execute("DELETE FROM jobs WHERE state = 'expired' AND expires_at < ?", (now - rows_after,))
-        return expired
+        with suppress(sqlite3.OperationalError):  # a full disk, or others are at it: the next time will do
+            self._db.executescript("PRAGMA incremental_vacuum")  # `execute` takes one step, which frees one page
+        return [row["folder"] for row in expired]
 
     def servers(self) -> set[str]:
         """Name the servers that hold jobs."""

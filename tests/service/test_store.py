@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import time
 from contextlib import closing
 from pathlib import Path
@@ -74,3 +75,34 @@ def test_a_store_that_is_opened_again_is_not_written_to(tmp_path: Path) -> None:
         written = log.read_bytes()
         JobStore(path).close()
         assert log.read_bytes() == written
+
+
+def test_what_a_job_showed_on_its_way_goes_with_its_files_and_the_room_is_given_back(tmp_path: Path) -> None:
+    path = tmp_path / "jobs.sqlite3"
+    with closing(JobStore(path)) as store:
+        for id in ("over", "kept"):
+            store.create(new_job(id, folder=id))
+            claim = store.claim("here", 15.0)
+            assert claim is not None
+            for _ in range(50):
+                assert store.note(id, claim.fence, "preview", {"xyz": [[0.1, 0.2, 0.3]] * 1000})
+                assert store.note(id, claim.fence, "progress", {"fraction": 0.5})
+            assert store.fail(id, claim.fence, InternalError("no"), expires_in=-1 if id == "over" else 60)
+        assert len(store.events("over")) == 102
+        assert store.expire(rows_after=60) == ["over"]
+        assert [event.kind for event in store.events("over")] == ["queued", "completed"]
+        assert len(store.events("kept")) == 102
+    with sqlite3.connect(path) as db:
+        assert db.execute("PRAGMA freelist_count").fetchone() == (0,)
+    db.close()
+
+
+def test_other_users_of_the_machine_cannot_look_into_what_is_kept(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        with closing(JobFolders(tmp_path / "data")), closing(JobStore(tmp_path / "data" / "jobs.sqlite3")) as store:
+            store.create(new_job("one", folder="one"))
+            for path in (tmp_path / "data", *(tmp_path / "data").iterdir()):
+                assert path.stat().st_mode & 0o077 == 0, path
+    finally:
+        os.umask(before)
