@@ -24,7 +24,7 @@ from straightpcf.points.formats.npy import Npy
 from straightpcf.points.formats.npz import Npz
 from straightpcf.points.formats.pcd import Pcd
 from straightpcf.points.formats.ply import Ply
-from straightpcf.points.formats.xyz import Csv, Pts, Xyz
+from straightpcf.points.formats.xyz import Csv, Pts, Tsv, Xyz
 
 __all__ = [
     "DEFAULT_MAX_POINTS",
@@ -40,7 +40,7 @@ __all__ = [
     "write_cloud",
 ]
 
-FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Csv(), Pts(), Kitti())
+FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Csv(), Tsv(), Pts(), Kitti())
 
 # Endings of files that would pass for another format's, and be scrambled.
 _NOT_OURS = {

@@ -11,7 +11,7 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyBytes, TooManyPoints
 from straightpcf.points.formats.scalars import not_held
 
-__all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room", "check_unpacked"]
+__all__ = ["DEFAULT_MAX_POINTS", "HEAD_BYTES", "Format", "check_count", "check_room", "check_unpacked", "most_unpacked"]
 
 DEFAULT_MAX_POINTS = 100_000_000
 HEAD_BYTES = 4096  # what `sniff` sees of a file
@@ -69,8 +69,13 @@ def check_room(needed: int, available: int, *, what: str) -> None:
         raise MalformedFile(f"{what} needs at least {needed} bytes, the file has {max(available, 0)}: it is truncated")
 
 
+def most_unpacked(packed: int) -> int:
+    """Return how many bytes a file of `packed` ones may take unpacked: a bomb takes all memory."""
+    return max(SMALL_UNPACKED_BYTES, MAX_UNPACKED_RATIO * packed)
+
+
 def check_unpacked(unpacked: int, packed: int, *, what: str) -> None:
-    """Raise TooManyBytes where `what` declares more bytes than a file of `packed` ones may: a bomb takes all memory."""
-    limit = max(SMALL_UNPACKED_BYTES, MAX_UNPACKED_RATIO * packed)
+    """Raise TooManyBytes where `what` declares more bytes than a file of `packed` ones may."""
+    limit = most_unpacked(packed)
     if unpacked > limit:
         raise TooManyBytes(f"{what} declares {unpacked} bytes unpacked; the limit for {packed} bytes is {limit}")

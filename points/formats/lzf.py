@@ -51,7 +51,7 @@ def decompress(packed: bytes, size: int) -> bytes:
     return bytes(out)
 
 
-def compress(data: bytes) -> bytes:
+def compress(data: bytes | bytearray) -> bytes:
     """Pack into a valid LZF stream: values that repeat become back references, everything else literal runs.
 
     Only repeats of the value before are sought: that is what images with empty regions and labels have, and numpy
@@ -72,11 +72,11 @@ def compress(data: bytes) -> bytes:
     return b"".join(pieces)
 
 
-def _literals(data: bytes, begin: int, end: int, pieces: list[bytes]) -> None:
+def _literals(data: bytes | bytearray, begin: int, end: int, pieces: list[bytes]) -> None:
     for at in range(begin, end, MAX_LITERAL):
         run = data[at : min(at + MAX_LITERAL, end)]
         pieces.append(bytes([len(run) - 1]))
-        pieces.append(run)
+        pieces.append(bytes(run))
 
 
 def _matches(length: int, pieces: list[bytes]) -> None:

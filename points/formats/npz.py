@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyBytes, UnsupportedCloud
-from straightpcf.points.formats.base import Format
+from straightpcf.points.formats.base import Format, check_unpacked, most_unpacked
 from straightpcf.points.formats.npy_array import (
     HEADER_BYTES,
     MAGIC,
@@ -35,7 +35,8 @@ KEYS = ("points", "xyz", "pos", "positions", "coord", "coords", "vertices")
 _NO_POSITIONS = ("normal", "color", "colour")  # how names of arrays begin that are (N, 3) as well
 MAX_MEMBERS = 1000
 MAX_UNPACKED_BYTES = 4 << 30
-MAX_ATTRIBUTE_BYTES = 4096  # of a point: what is beyond stays packed, as arrays that are no attributes do
+# Of a point: what is beyond stays packed, as arrays that are no attributes do. So does what `most_unpacked` forbids.
+MAX_ATTRIBUTE_BYTES = 4096
 _COPY_BYTES = 1 << 20
 
 
@@ -69,10 +70,11 @@ class Npz(Format):
             member = _choose(archive, members)
             where = f"array {member.filename[:80]}"
             header = positions_header(_head(archive, member), where=where, max_points=max_points)
+            check_unpacked(header.data_bytes, len(raw), what=where)
             array = _unpacked(archive, member, header)
             axes, attributes, fields = columns_of(array, header)
             xyz = widened(axes)
-            room = MAX_ATTRIBUTE_BYTES * len(xyz)
+            room = min(MAX_ATTRIBUTE_BYTES * len(xyz), most_unpacked(len(raw)) - len(array))
             for other in members:
                 head = b"" if other is member else _head(archive, other)
                 if not head.startswith(MAGIC):

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
-from straightpcf.points.formats.base import Format, check_count, check_room
+from straightpcf.points.formats.base import Format, check_count, check_room, check_unpacked
 from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, rounding, widened
@@ -114,6 +114,7 @@ def _unpacked(raw: bytes, header: PcdHeader) -> bytes:
     if size != expected:
         raise MalformedFile(f"compressed PCD data declares {size} bytes unpacked, the header's fields need {expected}")
     check_room(packed_size, len(raw) - header.size - 8, what=f"compressed PCD data at byte {header.size + 8}")
+    check_unpacked(size, len(raw), what="compressed PCD data")
     return lzf.decompress(raw[header.size + 8 : header.size + 8 + packed_size], size)
 
 
@@ -138,7 +139,7 @@ def _repacked(
 ) -> bytes:
     out = bytearray(unpacked)
     put_positions(_planes(out, source.header), new, old, names)
-    packed = lzf.compress(bytes(out))
+    packed = lzf.compress(out)
     begin = source.header.size
     (packed_size,) = struct.unpack_from("<I", source.raw, begin)
     sizes = struct.pack("<II", len(packed), len(out))

@@ -10,9 +10,10 @@ from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.text import shown
 
-__all__ = ["MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "words_of"]
+__all__ = ["MARKS", "MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "words_of"]
 
 MAX_COLUMNS = 4096
+MARKS = (b";", b",")  # what may stand between cells where it is not white space: the first that a row has
 _AROUND = b'" \t\n\v\f\r'  # a cell between delimiters
 # Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
 _POSITIONS = (
@@ -41,9 +42,9 @@ class Title:
 
 
 def named_columns(
-    names: Title | None, remarks: Sequence[Title], cells: Sequence[bytes], line: int
-) -> tuple[tuple[str, ...], tuple[int, int, int]]:
-    """Return a name for each column, and which columns are x, y and z: the first three where nothing says it.
+    names: Title | None, remarks: Sequence[Title], cells: Sequence[bytes], line: int, *, marks: Sequence[bytes] = MARKS
+) -> tuple[tuple[str, ...], tuple[int, int, int] | None]:
+    """Return a name for each column, and which columns are x, y and z, None where nothing says it.
 
     names: a line of names above the table; remarks: the comments there, of which the last that names them counts;
     cells: the first row's, whose number is `line`. Raises MalformedFile where names and rows do not go together.
@@ -51,25 +52,25 @@ def named_columns(
     columns = len(cells)
     labels = [f"column_{column + 1}" for column in range(columns)]
     for title in (names, *reversed(remarks)):
-        fitting = [words for some in _meant(title, columns) if (words := _fitted(some, cells))]
+        fitting = [words for some in _meant(title, columns, marks) if (words := _fitted(some, cells))]
         for words in fitting:
             if axes := _axes(words):
                 once = [word if word and words.count(word) == 1 else "" for word in words]
                 return tuple(word or label for word, label in zip(once, labels, strict=True)), axes
         if title is names and columns > 3:  # a remark may be any text
-            _refuse(title, line, columns, fits=bool(fitting))
-    return tuple(labels), (0, 1, 2)
+            _refuse(title, line, columns, marks, fits=bool(fitting))
+    return tuple(labels), None
 
 
-def delimiter_of(row: bytes) -> bytes | None:
+def delimiter_of(row: bytes, marks: Sequence[bytes] = MARKS) -> bytes | None:
     """Return what a row has between its cells, quoted ones left out; None for white space."""
     bare = b"".join(_by_quotes(row)[::2])
-    return next((mark for mark in (b";", b",") if mark in bare), None)
+    return next((mark for mark in marks if mark in bare), None)
 
 
-def words_of(row: bytes, most: int = MAX_COLUMNS) -> list[bytes]:
+def words_of(row: bytes, most: int = MAX_COLUMNS, *, marks: Sequence[bytes] = MARKS) -> list[bytes]:
     """Split a row, its quotes taken off; what is beyond the limit stays together as one more word."""
-    mark = delimiter_of(row)
+    mark = delimiter_of(row, marks)
     if mark is None:
         return row.split(None, most)
     parts = _by_quotes(row)
@@ -83,7 +84,7 @@ def _by_quotes(row: bytes) -> list[bytes]:
     return row.split(b'"') if count % 2 == 0 and count <= 4 * MAX_COLUMNS else [row]
 
 
-def _meant(title: Title | None, columns: int) -> Iterator[list[str]]:
+def _meant(title: Title | None, columns: int, marks: Sequence[bytes]) -> Iterator[list[str]]:
     """Yield the names in a title as they may be meant: `x [m]` as one, `Point Id` between tabs, `columns: x y z`.
 
     What is beyond columns + 1 names stays together as one more.
@@ -91,8 +92,8 @@ def _meant(title: Title | None, columns: int) -> Iterator[list[str]]:
     if title is None:
         return
     for text in (title.text, _LEAD.sub(b"", title.text)):
-        ways = [words_of(text, columns + 1)]
-        if delimiter_of(text) is None:
+        ways = [words_of(text, columns + 1, marks=marks)]
+        if delimiter_of(text, marks) is None:
             ways += [text.split(b"\t", columns + 1), _BEFORE_UNIT.sub(b"", text).split(None, columns + 1)]
         for words in ways:
             yield [word[:320].strip(b"\"' ").decode("utf-8", "replace")[:80] for word in words]
@@ -107,13 +108,13 @@ def _fitted(names: list[str], cells: Sequence[bytes]) -> list[str] | None:
     return names if len(names) == len(cells) else None
 
 
-def _refuse(names: Title | None, line: int, columns: int, *, fits: bool) -> None:
+def _refuse(names: Title | None, line: int, columns: int, marks: Sequence[bytes], *, fits: bool) -> None:
     """Raise where a line of names says nothing of positions, or is of more or fewer columns than a row has."""
     if names and fits:
         known = "; ".join(", ".join(three) for three in _POSITIONS)
         said = f"the names above line {line} do not say which columns are x, y, z: {shown(names.text)}"
         raise MalformedFile(f"{said}; known are {known}")
-    for words in _meant(names, columns):
+    for words in _meant(names, columns, marks):
         if names and _axes(words):
             more = " or more" if len(words) > columns + 1 else ""
             said = f"line {names.line} names {len(words)}{more} columns: {shown(names.text)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,14 +29,15 @@ from straightpcf.points.formats.text import (
     replaced,
     shown,
 )
-from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
+from straightpcf.points.formats.titles import MARKS, MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
 
-__all__ = ["MAX_COLUMNS", "Csv", "Pts", "Xyz"]
+__all__ = ["MAX_COLUMNS", "Csv", "Pts", "Tsv", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
 MAX_LINES_ABOVE = 100_000  # they are read one by one: a tenth of a second
 _COMMENTS = (b"#", b"//")
 _SEPARATOR = re.compile(rb'"?sep=.?"?', re.IGNORECASE)  # Excel's first line; the rows say it, too
+_COUNTED = 10  # points: of fewer, an x may go up by one each
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 _BOM = b"\xef\xbb\xbf"
 # What stands behind x, y, z in a .pts file of so many columns.
@@ -52,7 +53,7 @@ class Layout:
     """Describe the table; begin, line: byte offset and line number of its first line.  axes: the columns of x, y, z.
 
     declared: the number of points if a line of its own says it, as in `.pts`: those up to the next such line, of a
-    further scan.  delimiter: None for white space.
+    further scan.  delimiter: None for white space.  is_named: whether something says which columns the axes are.
     """
 
     begin: int
@@ -61,6 +62,7 @@ class Layout:
     delimiter: bytes | None
     names: tuple[str, ...]
     axes: tuple[int, int, int]
+    is_named: bool = True
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,18 @@ class Xyz(Format):
     """Read and write text tables of at least three columns between white space, commas or semicolons.
 
     x, y, z are the columns that a line of names above the table says, and the first three where there is none
-    (`titles`); names of more than three columns that say nothing of positions, or that are of more or fewer columns
-    than the table has, are refused. Between commas or semicolons a cell that is empty, `NA` or `null` is NaN, and one
-    in quotes may hold them. Comment lines (`#`, `//`), blank lines, lines with the number of points and columns of any
-    text are kept.
+    (`titles`). Refused are names of more than three columns that say nothing of positions, or that are of more or fewer
+    columns than the table has, and more than three columns without names whose first counts the points. Between commas
+    or semicolons a cell that is empty, `NA` or `null` is NaN, and one in quotes may hold them. Comment lines (`#`,
+    `//`), blank lines, lines with the number of points and columns of any text are kept.
     """
 
     name = "xyz"
-    suffixes: ClassVar[tuple[str, ...]] = (".xyz", ".txt", ".asc", ".xyzn", ".xyzrgb", ".tsv")
+    suffixes: ClassVar[tuple[str, ...]] = (".xyz", ".txt", ".asc", ".xyzn", ".xyzrgb")
     media_type = "text/plain"
     has_magic = False
     delimiter: ClassVar[bytes | None] = None  # of a new file; None for a space
+    marks: ClassVar[tuple[bytes, ...]] = MARKS  # that may be between cells
     types = _TYPES
     is_counted: ClassVar[bool] = False  # a new file begins with the number of points
 
@@ -104,10 +107,12 @@ class Xyz(Format):
         """Read the table; further columns that hold numbers become float64 attributes, or int64 where they need to."""
         raw = path.read_bytes()
         refuse_binary(raw, 0)
-        layout = _layout(raw)
+        layout = _layout(raw, self.marks)
         if layout.declared is not None:
             check_count(layout.declared, max_points, f"line {layout.line - 1}")
         starts, ends, columns, texts = _table(raw, layout, max_points)
+        if not layout.is_named:
+            _refuse_counted(columns, layout.line)
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
         attributes = {layout.names[column]: values for column, values in columns.items()}
         source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
@@ -147,6 +152,19 @@ class Csv(Xyz):
     delimiter = b","
 
 
+class Tsv(Xyz):
+    """Do as `Xyz`, but tabs are between cells, which may be empty or hold spaces; a file without any is read as that.
+
+    A new table has names above if there are attributes.
+    """
+
+    name = "tsv"
+    suffixes = (".tsv",)
+    media_type = "text/tab-separated-values"
+    delimiter = b"\t"
+    marks = (b"\t", *MARKS)
+
+
 class Pts(Xyz):
     """Do as `Xyz`; a new table has the number of points above, and no names: x y z, intensity, red green blue."""
 
@@ -171,7 +189,7 @@ class Pts(Xyz):
         return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(cloud.attributes)), " ")
 
 
-def _layout(raw: bytes) -> Layout:
+def _layout(raw: bytes, marks: Sequence[bytes]) -> Layout:
     """Read what stands above the table, up to the first line that is neither blank, comment, count nor names."""
     at, line = len(_BOM) if raw.startswith(_BOM) else 0, 1
     declared: int | None = None
@@ -182,56 +200,68 @@ def _layout(raw: bytes) -> Layout:
             raise UnsupportedCloud(
                 f"no point is in the first {MAX_LINES_ABOVE} lines, the limit of what stands above them"
             )
-        text, end = _line_at(raw, at)
+        text, end = _line_at(raw, at, marks)
         if text.startswith(_COMMENTS) or _SEPARATOR.fullmatch(text):
             remarks.append(Title(line, text[:_REMARK_BYTES].lstrip(b"#/ ")))
         elif text and declared is None and names is None and text.isdigit() and len(text) <= 18:
             declared = int(text)
-        elif text and names is None and (_are_names(text) or _are_numbered(text, _line_at(raw, end)[0])):
+        elif (
+            text
+            and names is None
+            and (_are_names(text, marks) or _are_numbered(text, _line_at(raw, end, marks)[0], marks))
+        ):
             names = Title(line, text.lstrip(b"% "))  # MATLAB's comments
         elif text:
-            return _described(at, line, declared, text, names, remarks)
+            return _described(at, line, declared, text, names, remarks, marks)
         at, line = end, line + 1
     return Layout(len(raw), line, declared, None, ("x", "y", "z"), (0, 1, 2))
 
 
-def _line_at(raw: bytes, begin: int) -> tuple[bytes, int]:
-    """Return the line at byte `begin` without the white space around it, and where the next one begins."""
+def _line_at(raw: bytes, begin: int, marks: Sequence[bytes]) -> tuple[bytes, int]:
+    """Return the line at byte `begin` without white space around it that marks no cell, and where the next begins."""
     found = _LINE_END.search(raw, begin)
     end = found.end() if found else len(raw)
-    return raw[begin:end].strip(), end
+    text = raw[begin:end]
+    return text.strip() if b"\t" not in marks or not text.strip() else text.strip(b" \n\v\f\r"), end
 
 
 def _described(
-    begin: int, line: int, declared: int | None, row: bytes, names: Title | None, remarks: Iterable[Title]
+    begin: int,
+    line: int,
+    declared: int | None,
+    row: bytes,
+    names: Title | None,
+    remarks: Iterable[Title],
+    marks: Sequence[bytes],
 ) -> Layout:
-    cells = words_of(row)
+    cells = words_of(row, marks=marks)
     if len(cells) < 3:
         raise MalformedFile(f"line {line} has {len(cells)} columns, a point needs three: {shown(row)}")
     if len(cells) > MAX_COLUMNS:
         raise UnsupportedCloud(f"line {line} has more than {MAX_COLUMNS} columns, the limit")
-    labels, axes = named_columns(names, list(remarks), cells, line)
+    labels, axes = named_columns(names, list(remarks), cells, line, marks=marks)
     if declared is not None and labels[0] == "column_1" and len(labels) in _PTS_COLUMNS:
         labels = (*AXES, *_PTS_COLUMNS[len(labels)])
-    return Layout(begin, line, declared, delimiter_of(row), labels, axes)
+    is_named = axes is not None or declared is not None
+    return Layout(begin, line, declared, delimiter_of(row, marks), labels, axes or (0, 1, 2), is_named)
 
 
-def _are_names(text: bytes) -> bool:
-    words = words_of(text)
-    has_gaps = delimiter_of(text) is not None and all(is_missing(word) for word in words)
+def _are_names(text: bytes, marks: Sequence[bytes]) -> bool:
+    words = words_of(text, marks=marks)
+    has_gaps = delimiter_of(text, marks) is not None and all(is_missing(word) for word in words)
     return len(words) >= 3 and not has_gaps and not any(_is_number(word) for word in words)
 
 
-def _are_numbered(text: bytes, following: bytes) -> bool:
+def _are_numbered(text: bytes, following: bytes, marks: Sequence[bytes]) -> bool:
     """Say whether a line is pandas' 0, 1, 2... above columns without names; the line after it tells it from a point.
 
     Before them may stand the empty name of an index.
     """
-    words = words_of(text)
+    words = words_of(text, marks=marks)
     lead = int(words[0] == b"")
     if len(words) < lead + 3 or words[lead:] != [b"%d" % column for column in range(len(words) - lead)]:
         return False
-    row = words_of(following)
+    row = words_of(following, marks=marks)
     return len(row) == len(words) and not any(word.lstrip(b"+-").isdigit() for word in row[lead : lead + 3])
 
 
@@ -288,6 +318,17 @@ def _table(
     there = {*layout.axes} | ({*parts} - unsaid)
     columns = {column: _joined(values) for column, values in parts.items() if column in there}
     return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
+
+
+def _refuse_counted(columns: Mapping[int, npt.NDArray[Any]], line: int) -> None:
+    """Raise where a first column that nothing names counts the points: moved as x, it would be lost, and z left out."""
+    first = columns[0]
+    is_table = 3 in columns and len(first) >= _COUNTED and np.array_equal(first, first[0] + np.arange(len(first)))
+    if is_table and float(first[0]).is_integer():
+        raise UnsupportedCloud(
+            f"the first of {max(columns) + 1} columns counts the points from {first[0]:.0f} on, and nothing above line "
+            f"{line} says which are x, y, z: put a line of names there, such as `id x y z`"
+        )
 
 
 def _scans(lines: Lines, numbers: npt.NDArray[np.int64]) -> int:

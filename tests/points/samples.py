@@ -82,6 +82,8 @@ _FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "xyz spaces": ("a.xyz", lambda: _text(" ")),
     "xyz tabs, comments": ("a.txt", lambda: _text(" \t", "# made by hand", "", "// two")),
     "xyz csv": ("a.csv", lambda: _text(",", '"x","Y","z","Number"', end="\r\n")),
+    "tsv": ("a.tsv", lambda: _text("\t", "x\ty\tz\tNumber")),
+    "tsv without tabs": ("a.tsv", lambda: _text(" ")),
     "xyz semicolons": ("a.asc", lambda: _text("; ")),
     "xyz pts": ("a.pts", lambda: _text(" ", str(N))),
     "npy float32": ("a.npy", lambda: npy(torus(N).astype("<f4"))),

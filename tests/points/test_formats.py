@@ -101,7 +101,7 @@ def test_a_cloud_of_another_format_is_written_whole(format: Format, tmp_path: Pa
     again, found = read_cloud(path)
     assert found is format
     np.testing.assert_allclose(again.xyz, cloud.xyz, atol=TOLERANCE.get(format.name, 0))
-    if format.name in ("ply", "pcd", "npz", "xyz", "csv", "pts"):
+    if format.name in ("ply", "pcd", "npz", "xyz", "csv", "tsv", "pts"):
         lost = format.left_behind(cloud)
         assert lost == (["label"] if format.name == "pts" else [])
         for name, values in cloud.attributes.items():

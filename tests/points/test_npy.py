@@ -224,6 +224,23 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(rows: int, tmp_path: Path) 
         tracemalloc.stop()
 
 
+def test_what_a_small_archive_unpacks_to_is_limited(tmp_path: Path) -> None:
+    wide = np.zeros((20_000, 2_000))  # 320 MB, of 0.4 MB packed
+    wide[:, :3] = torus(20_000)
+    raw = npz(points=wide)
+    tracemalloc.start()
+    try:
+        with pytest.raises(TooManyBytes, match=rf"points.npy declares 320000000 bytes unpacked.* {len(raw)} bytes"):
+            read(tmp_path, raw)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+    label = np.zeros((100_000, 100))  # 80 MB
+    cloud = read(tmp_path, npz(points=torus(100_000), **{str(n): label for n in range(4)}))
+    assert list(cloud.attributes) == ["0", "1", "2"]
+    assert cloud.beside == ("3.npy",)
+
+
 def test_a_zip_that_declares_more_than_the_limit_is_refused_unread(tmp_path: Path) -> None:
     """The declared size of a member, in the central directory, is set to 4 GiB - 1 twice."""
     raw = bytearray(npz(points=torus(5), more=np.arange(5)))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from straightpcf.points.cloud import PointCloud
-from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.errors import MalformedFile, TooManyBytes, UnsupportedCloud
 from straightpcf.points.formats import format_named, lzf, read_cloud, write_cloud
 from tests.clouds import torus
 from tests.points.foreign_samples import pcd
@@ -186,6 +187,22 @@ def test_sizes_of_compressed_data_that_cannot_be_are_refused(packed: int, size: 
     struct.pack_into("<I", raw, at + packed, size % 2**32)
     with pytest.raises(MalformedFile, match=r"truncated|unpacked|LZF"):
         _read(tmp_path, bytes(raw))
+
+
+def test_a_compressed_bomb_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    """1000 points of 300 kB each, nearly all zeros, in some 3.4 MB."""
+    head = "VERSION 0.7\nFIELDS x y z pad\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 75000\nWIDTH 1000\nHEIGHT 1\n"
+    head += "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 1000\nDATA binary_compressed\n"
+    size = 1000 * 300_012
+    packed = bytes(size // 89 + 1)
+    raw = head.encode() + struct.pack("<II", len(packed), size) + packed
+    tracemalloc.start()
+    try:
+        with pytest.raises(TooManyBytes, match=rf"PCD data declares {size} bytes unpacked; the limit for {len(raw)}"):
+            _read(tmp_path, raw)
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_moved_value_that_float32_cannot_hold_is_named(tmp_path: Path) -> None:

@@ -253,6 +253,51 @@ def test_a_table_is_written_anew_only_where_another_layout_is_wanted(
     assert (tmp_path / "result-1").read_bytes() == expected
 
 
+TABBED = {
+    "names": b"id\tcolour\tx\ty\tz\n7\tred car\t1\t2\t3\n8\t\t4\t5\t6\n",
+    "a first column that is empty": b"\tx\ty\tz\n\t1\t2\t3\n\t4\t5\t6\n",
+    "a last column that is empty": b"x\ty\tz\tnote\n1\t2\t3\t\n4\t5\t6\t\r\n",
+    "commas in a cell": b"note\tx\ty\tz\na, b\t1\t2\t3\n\t4\t5\t6\n",
+    "a blank line": b"x\ty\tz\n\n1\t2\t3\n \n4\t5\t6\n",
+    "spaces around": b"# x\ty\tz\n 1 \t 2\t3 \n4\t5\t 6\n",
+}
+
+
+@pytest.mark.parametrize("case", TABBED)
+def test_a_cell_between_tabs_may_be_empty_or_hold_spaces(case: str, tmp_path: Path) -> None:
+    cloud = read(tmp_path, TABBED[case], "a.tsv")
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [4, 5, 6]])
+    cloud.xyz[0, 0] = 9
+    write_cloud(cloud, tmp_path / "b.tsv", format_named("tsv"))
+    assert (tmp_path / "b.tsv").read_bytes() == TABBED[case].replace(b"1", b"9.0", 1)
+
+
+@pytest.mark.parametrize("separator", [" ", ",", "\t"])
+@pytest.mark.parametrize("start", [0, 1, 5000])
+def test_a_first_column_that_counts_the_points_is_never_taken_for_x(separator: str, start: int, tmp_path: Path) -> None:
+    rows = [separator.join([str(start + n), f"{n % 7}.5", "2", "3.25", "tree"]) for n in range(50)]
+    raw = "\n".join(rows).encode()
+    with pytest.raises(UnsupportedCloud, match=rf"counts the points from {start} on.*line of names"):
+        read(tmp_path, raw, "a.tsv" if separator == "\t" else "a.xyz")
+    named = read(tmp_path, separator.join(["id", "x", "y", "z", "code"]).encode() + b"\n" + raw, "b.txt")
+    np.testing.assert_array_equal(named.xyz[0], [0.5, 2, 3.25])
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [f"{n} 0 1" for n in range(50)],  # a line of points
+        [f"{n % 10} {n // 10} 1 7" for n in range(50)],  # a grid
+        [f"{n + 0.5} 0 1 7" for n in range(50)],
+        [f"{n} 0 1 7" for n in range(9)],
+        [f"{2 * n} 0 1 7" for n in range(50)],
+    ],
+)
+def test_an_x_that_only_looks_like_it_is_one(rows: list[str], tmp_path: Path) -> None:
+    cloud = read(tmp_path, "\n".join(rows).encode())
+    np.testing.assert_array_equal(cloud.xyz[:, 0], [float(row.split()[0]) for row in rows])
+
+
 MALFORMED = {
     "bad token": (b"1 2 3\n4 5 6\n\n7 8,9 0\n", r"line 4, column 2.*8,9"),
     "a name among numbers": (b"x y z\n1 2 3\n1 z 3\n", r"line 3, column 2.*z"),
