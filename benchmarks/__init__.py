@@ -1,1 +1,4 @@
-"""Commands that print this project's figures, each `python -m benchmarks.<name>`; what they said is in RESULTS.md."""
+"""Commands that print this project's figures, each `python -m benchmarks.<name>`; what they said is in RESULTS.md.
+
+conventional.py, reference.py and shapes.py are no commands: other filters, the published scheme, and clouds with noise.
+"""
