@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import NORMALS, PointCloud
+from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room, check_unpacked
 from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import PcdField, PcdHeader, read_header
-from straightpcf.points.formats.positions import AXES, changes, moved, put_positions, rounding, widened
+from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import scalar_columns
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
 __all__ = ["Pcd"]
 
-_NORMAL_FIELDS = frozenset(name for names in NORMALS for name in names)
 _MOST_LOST = 1e-6  # of a new file's extent, by float positions; those of an object or a frame lose 1e-7
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 
@@ -155,7 +154,7 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         what=f"PCD data of {header.points} points with {width} values",
     )
     parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
-    kept = {field.label for field in header.fields if field.label in header.axes or field.label in _NORMAL_FIELDS}
+    kept = WRITTEN.intersection(field.label for field in header.fields)
     tokens: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]] = {name: [] for name in kept}
     left, line = header.points, header.lines + 1
     for lines, _ in blocks(raw, header.size) if left else ():

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats.base import check_room
 from straightpcf.points.formats.ply_header import PlyElement, PlyProperty
-from straightpcf.points.formats.positions import gathered
+from straightpcf.points.formats.positions import WRITTEN, gathered
 from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, shown
 
 __all__ = ["AsciiRows", "BinaryRows", "ascii_rows", "binary_rows", "scalar_offsets"]
@@ -26,7 +26,8 @@ _Offsets = npt.NDArray[np.int64]
 class AsciiRows:
     """Hold the scalars of a text element; end, line: byte offset and line number after its last row.
 
-    starts, ends: scalar name -> (N,) int64, byte offsets of its token.  values: name -> (N,), of the declared type.
+    starts, ends: name -> (N,) int64, byte offsets of its token: of what may be written anew, positions and normals,
+    because they take ten times a short token's bytes.  values: name -> (N,), of every scalar, of the declared type.
     """
 
     end: int
@@ -60,12 +61,13 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, line: int, *, keep: 
         what=f"element {element.name} of {element.count} rows",
     )
     scalars = [p.name for p in element.properties if p.counter is None] if keep else []
-    pieces: dict[str, list[tuple[_Offsets, _Offsets, npt.NDArray[Any]]]] = {name: [] for name in scalars}
+    pieces: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in scalars}
+    places: dict[str, list[tuple[_Offsets, _Offsets]]] = {name: [] for name in scalars if name in WRITTEN}
     rows_left, end = element.count, begin
     for lines, block_end in blocks(raw, begin) if rows_left else ():
         # A row without properties is a blank line.
         filled = np.flatnonzero(lines.counts if element.properties else lines.counts + 1)[:rows_left]
-        _walk(lines.pick(filled), element, line + filled, pieces)
+        _walk(lines.pick(filled), element, line + filled, pieces, places)
         rows_left -= len(filled)
         seen = len(lines) if rows_left else int(filled[-1]) + 1
         end = int(lines.line_starts[seen]) if seen < len(lines) else block_end
@@ -81,9 +83,9 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, line: int, *, keep: 
     return AsciiRows(
         end,
         line,
-        {name: _joined([piece[0] for piece in parts], np.dtype(np.int64)) for name, parts in pieces.items()},
-        {name: _joined([piece[1] for piece in parts], np.dtype(np.int64)) for name, parts in pieces.items()},
-        {name: _joined([piece[2] for piece in parts], kinds[name]) for name, parts in pieces.items()},
+        {name: _joined([place[0] for place in parts], np.dtype(np.int64)) for name, parts in places.items()},
+        {name: _joined([place[1] for place in parts], np.dtype(np.int64)) for name, parts in places.items()},
+        {name: _joined(parts, kinds[name]) for name, parts in pieces.items()},
     )
 
 
@@ -91,7 +93,8 @@ def _walk(
     lines: Lines,
     element: PlyElement,
     numbers: _Offsets,
-    pieces: dict[str, list[tuple[_Offsets, _Offsets, npt.NDArray[Any]]]],
+    pieces: dict[str, list[npt.NDArray[Any]]],
+    places: dict[str, list[tuple[_Offsets, _Offsets]]],
 ) -> None:
     """Step through the properties of all lines at once; `at` is each line's next token.  numbers: of the lines."""
     at, stop = lines.first.copy(), lines.first + lines.counts
@@ -116,7 +119,9 @@ def _walk(
             if bad is not None:
                 token = lines.raw[starts[bad] : ends[bad]]
                 raise _bad_token(token, prop.dtype.name, element, prop, int(numbers[bad]))
-            pieces[prop.name].append((starts, ends, values))
+            pieces[prop.name].append(values)
+            if prop.name in places:
+                places[prop.name].append((starts, ends))
     if (at != stop).any():
         row = int(np.argmax(at != stop))
         raise MalformedFile(

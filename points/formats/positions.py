@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 
 __all__ = [
     "AXES",
+    "WRITTEN",
     "axes_among",
     "changes",
     "gathered",
@@ -26,6 +27,7 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
+WRITTEN = frozenset(name for names in (AXES, ("X", "Y", "Z"), *NORMALS) for name in names)  # anew, in a file's place
 
 
 def axes_among(names: Collection[str]) -> tuple[str, ...]:

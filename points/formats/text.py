@@ -241,14 +241,19 @@ def replaced(
 ) -> bytes:
     """Return `raw` with the tokens of the moved coordinates rewritten; starts, ends: (N, 3) byte offsets."""
     changed = moved(new, old)
-    begins, stops, texts = starts[changed], ends[changed], new[changed]
+    begins, stops, numbers = starts[changed], ends[changed], new[changed]
     order = np.argsort(begins, kind="stable")
-    begins, stops, words = begins[order], stops[order], number_text(texts[order])
-    pieces: list[bytes] = [b""] * (2 * len(words) + 1)
-    pieces[1::2] = words
-    kept_from, kept_to = [0, *stops.tolist()], [*begins.tolist(), len(raw)]
-    pieces[0::2] = [raw[start:stop] for start, stop in zip(kept_from, kept_to, strict=True)]
-    return b"".join(pieces)
+    parts: list[bytes] = []
+    at = 0
+    for begin in range(0, len(order), _STEP_TOKENS):  # a piece of text takes several times its length in memory
+        some = order[begin : begin + _STEP_TOKENS]
+        pieces: list[bytes] = [b""] * (2 * len(some))
+        pieces[1::2] = number_text(numbers[some])
+        kept_from = [at, *stops[some[:-1]].tolist()]
+        pieces[0::2] = [raw[start:stop] for start, stop in zip(kept_from, begins[some].tolist(), strict=True)]
+        parts.append(b"".join(pieces))
+        at = int(stops[some[-1]])
+    return b"".join([*parts, raw[at:]])
 
 
 def shown(token: bytes) -> str:

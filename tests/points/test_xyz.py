@@ -401,3 +401,15 @@ def test_endless_lines_above_the_table_are_refused_before_they_take_time(line: b
     with pytest.raises(UnsupportedCloud, match="first 100000 lines, the limit"):
         read(tmp_path, line * 20_000_000 + b"1 2 3\n")
     assert time.monotonic() - began < 10
+
+
+def test_to_write_a_table_takes_a_few_times_its_size(tmp_path: Path) -> None:
+    np.savetxt(path := tmp_path / "a.xyz", torus(200_000), fmt="%.6f")
+    cloud, xyz = read_cloud(path)
+    tracemalloc.start()
+    try:
+        write_cloud(cloud.with_xyz(cloud.xyz + 1e-3), tmp_path / "b.xyz", xyz)
+        assert tracemalloc.get_traced_memory()[1] < 12 * path.stat().st_size
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "b.xyz"), cloud.xyz + 1e-3)
