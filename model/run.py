@@ -240,7 +240,14 @@ class Run:
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
         owner = self.filter
         tiles = tiles or split(xyz, owner.tile_points)
-        return Tiling(xyz, tiles, coverage=owner.coverage, seed=self.options.seed, device=owner.device)
+        return Tiling(
+            xyz,
+            tiles,
+            coverage=owner.coverage,
+            seed=self.options.seed,
+            device=owner.device,
+            workers=owner.threads,
+        )
 
 
 def _numbers(xyz: npt.ArrayLike) -> npt.NDArray[np.float64]:
