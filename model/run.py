@@ -76,14 +76,14 @@ class Run:
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
-        self.far_out = len(xyz) - self.not_finite - len(self.rows)
+        self.far_out_count = len(xyz) - self.not_finite - len(self.rows)
         if len(self.rows) < MIN_POINTS:
-            others = f"{self.not_finite} not finite, {self.far_out} far out"
+            others = f"{self.not_finite} not finite, {self.far_out_count} far out"
             raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
         self._take()
         apart = self._apart()
-        self.apart = int(apart.sum())
-        if self.apart:
+        self.apart_count = int(apart.sum())
+        if self.apart_count:
             self.rows = self.rows[~apart]
             self._take()
         self.iterations, self._progress = 0, 0.0
@@ -135,11 +135,11 @@ class Run:
         out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
         warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
-        if self.far_out:
+        if self.far_out_count:
             farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
-            warnings.append(f"{self.far_out} points are {farther} and were passed through")
-        if self.apart:
-            warnings.append(f"{self.apart} points lie apart from all others and were passed through")
+            warnings.append(f"{self.far_out_count} points are {farther} and were passed through")
+        if self.apart_count:
+            warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
         if held := np.count_nonzero(self.held[self.points.inverse]):
             warnings.append(f"{held} points are on walls closer together than points are, and were held back")
         if self.frame.radius == 0.0:
