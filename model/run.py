@@ -109,8 +109,8 @@ class Run:
         return apart[self.points.inverse]
 
     def patches(self) -> Iterator[FinishedPatch]:
-        """Run pass after pass."""
-        if self.frame.radius == 0.0:
+        """Run pass after pass; none where there is nothing to tell noise from."""
+        if len(self.points.xyz) < MIN_POINTS:
             return
         planned = None if self.options.iterations == "auto" else self.options.iterations
         tiles = split(self.points.xyz, self.filter.tile_points)
@@ -132,7 +132,8 @@ class Run:
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
         out = self.xyz.copy()
-        out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
+        if self.iterations:  # else even the sign of a zero stays
+            out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
         warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
         if self.far_out_count:
@@ -144,6 +145,9 @@ class Run:
             warnings.append(f"{held} points are on walls closer together than points are, and were held back")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
+        elif len(self.points.xyz) < MIN_POINTS:
+            places = f"all points lie in {len(self.points.xyz)} places"
+            warnings.append(f"{places}: nothing is filtered where they are fewer than {MIN_POINTS}")
         elif len(self.points.xyz) < _FEW_POINTS:
             warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
         noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
