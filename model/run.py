@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.distinct import Distinct
+from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, far_out, isolated
@@ -99,7 +99,7 @@ class Run:
     def _take(self) -> None:
         cloud = self._of_rows()
         self.frame = CloudFrame.of(cloud)
-        self.points = Distinct(cloud)
+        self.points = Distinct(cloud, cell=cell_of(cloud))
 
     def _apart(self) -> npt.NDArray[np.bool_]:
         """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
