@@ -77,6 +77,18 @@ def test_scaling() -> None:
     assert [row[0] for row in rows] == ["500", "1000"]
 
 
+def test_passes(tmp_path: Path) -> None:
+    clouds = {f"{name}/1000": sphere(1000) for name in "abcde"}
+    clouds |= {f"f/{count}": sphere(count) for count in (10_000, 50_000)}  # the one held out
+    np.savez(tmp_path / "shapes.npz", **clouds)
+    options = ("--noise", 0.02, "--passes", 1, "--threads", 1, "--data", tmp_path / "shapes.npz")
+    _, row = printed("passes", DEFAULT_WEIGHTS, *options).splitlines()
+    noise, number, chamfer, across, sunk = map(float, row.split()[1:])
+    assert (noise, number) == (0.02, 1)
+    assert chamfer > across > sunk
+    assert 0 < across < 4  # the noise's own is 4
+
+
 def test_kernels_that_cannot_be_compiled_are_not_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     if cpu._SHIPPED.is_dir():
         pytest.skip("the kernels are shipped here")
