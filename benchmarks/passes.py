@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from benchmarks.quality import SHARED
+from benchmarks.shapes import make_noise
 from straightpcf.model.filter import Filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.normalize import CloudFrame
@@ -31,6 +32,7 @@ from straightpcf.points.options import DenoiseOptions
 
 _AROUND = 150  # points of the 50K over which curvature is taken
 _TENTHS = 10
+_RESOLUTION = 10_000
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument("--threads", type=int)
     arguments = parser.parse_args()
-    truths = []
     with np.load(arguments.data) as archive:
-        for shape in sorted(held_out_shapes(archive.files)):
-            clean = archive[f"{shape}/10000"].astype(np.float64)
-            frame = CloudFrame.of(clean)
-            truths.append(Truth.of(frame.enter(clean), frame.enter(archive[f"{shape}/50000"].astype(np.float64))))
+        truths = [Truth.read(archive, shape, _RESOLUTION) for shape in sorted(held_out_shapes(archive.files))]
     print(f"{'velocities':40} noise  pass     CD  across   sunk")
     for state in arguments.states:
         network, _ = read_network(state)
@@ -99,7 +97,7 @@ def main() -> None:
         for noise in arguments.noise:
             rows = np.zeros((arguments.passes, 3))
             for truth in truths:
-                xyz = truth.clean + noise * np.random.default_rng(0).standard_normal(truth.clean.shape)
+                xyz = make_noise("gaussian", truth.clean, noise, seed=0)
                 for row in rows:
                     xyz = model.denoise(xyz, DenoiseOptions(iterations=1)).xyz
                     row += np.array(truth.measures(xyz)) / len(truths)

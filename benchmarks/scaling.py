@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import os
 import resource
 import time
 from pathlib import Path
 
 import numpy as np
+
+from straightpcf.model.cpus import usable_cpus
 
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 FIT_FROM = 10_000  # below, one patch is most of the cloud
@@ -24,7 +25,7 @@ def main() -> None:
     """Print a row for each size."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=POINTS)
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=usable_cpus())
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
     print(f"{options.threads} threads, one pass\n{'points':>9} {'seconds':>9} {'peak MiB':>9} {'points/s':>9}")

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from benchmarks.quality import SHARED
 from benchmarks.shapes import Shape, analytic, make_noise, punet
+from straightpcf.model.cpus import usable_cpus
 
 if TYPE_CHECKING:
     from straightpcf.model.patches import Patches
@@ -226,7 +227,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--resolution", type=int, nargs="+", default=[10000, 50000])
     parser.add_argument("--iterations", type=int, default=1, help="passes of both")
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=usable_cpus())
     parser.add_argument("--device", default="cpu", help='"cpu" (the default) or "cuda"')
     parser.add_argument(
         "--patches",

@@ -1,29 +1,49 @@
-"""The distinct positions of a cloud, and which of its points lie at each."""
+"""The places of a cloud, and which of its points lie at each."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Distinct"]
+__all__ = ["Distinct", "cell_of", "half_reach"]
+
+Floats = npt.NDArray[np.float64]
+
+# How large a cell is beside a cloud, as a power of two: 2^-20 is about 1e-6. No scanner resolves that; a copy that went
+# through float32 is off by 3e-8 at most, so that a border parts few pairs; and of a million points drawn at random on a
+# sphere one pair in ten clouds is so near. Copies that are not one place leave no point any neighbour but themselves,
+# and what is seen in their patches is no noise.
+_CELL_EXPONENT = -20
+_SOME = 10_000  # positions that tell how large a cloud is
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits
 
 
 class Distinct:
-    """The distinct positions of a cloud; points in one place (a depth camera's zeros) move together.
+    """The places of a cloud; points in one place (a depth camera's zeros, two copies of a scan) move together.
 
-    xyz: (U, 3) float64; inverse: (N,) the distinct row of each point. Without duplicates both keep the order.
+    xyz: (U, 3) float64, the position of one point of each; inverse: (N,) the place of each point. Where no two points
+    share one, both keep the order. cell: points that lie in one cell of that edge, in the cloud's unit, are in one
+    place; 0 leaves equal points. There are two grids, half a cell apart; pairs that a border of each parts stay two.
     """
 
-    def __init__(self, xyz: npt.NDArray[np.float64]) -> None:
+    def __init__(self, xyz: Floats, *, cell: float = 0.0) -> None:
         self.xyz, self.inverse, self.repeated = xyz, np.arange(len(xyz)), False
-        if not _may_repeat(xyz):
+        # One grid after the other, of what the first has left: links through both could chain a whole dense part.
+        for rounding in (np.floor, np.rint) if cell else (None,):
+            grouped = _grouped(self.xyz, cell, rounding)
+            if grouped is not None:
+                first, group = grouped
+                self.xyz, self.inverse, self.repeated = self.xyz[first], group[self.inverse], True
+        if not self.repeated:
             return
-        unique, inverse = np.unique(xyz, axis=0, return_inverse=True)
-        if len(unique) == len(xyz):
-            return
-        self.xyz, self.inverse, self.repeated = unique, inverse.reshape(-1), True
+        by_position = np.lexsort(self.xyz.T[::-1])
+        place = np.empty_like(by_position)
+        place[by_position] = np.arange(len(place))
+        self.xyz, self.inverse = self.xyz[by_position], place[self.inverse]
         self._order = np.argsort(self.inverse, kind="stable")
-        self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(unique) + 1))
+        self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(place) + 1))
 
     def copies(self, distinct: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the points that lie at some distinct rows."""
@@ -33,11 +53,64 @@ class Distinct:
         return np.concatenate(groups) if groups else distinct.astype(np.int64)
 
 
-def _may_repeat(xyz: npt.NDArray[np.float64]) -> bool:
-    """Say whether any two rows may be equal: by hashes, which are sorted in a third of the memory of rows."""
+def cell_of(xyz: Floats) -> float:
+    """Return the edge of the cells of a finite cloud (N, 3) in which points are one place; 0 where all coincide.
+
+    About 1e-6 of its size, which is half of its positions': far points shall not make one place of all others. A power
+    of two: dividing by it rounds nothing.
+    """
+    _, reach = half_reach(xyz)
+    return math.ldexp(1.0, math.frexp(reach)[1] + 1 + _CELL_EXPONENT) if reach > 0 else 0.0
+
+
+def half_reach(xyz: Floats) -> tuple[Floats, float]:
+    """Return the middle (3,) of a cloud (N, 3) and how far half of its positions reach from it, both halved.
+
+    Of some of its positions, each taken once: where many rows say "no data", all say the same. Whole, they might
+    overflow.
+    """
+    some = Distinct(xyz[:: max(1, len(xyz) // _SOME)]).xyz / 2
+    middle = np.median(some, axis=0)
+    return middle, float(np.median(np.abs(some - middle).max(axis=1)))
+
+
+def _grouped(
+    xyz: Floats, cell: float, rounding: np.ufunc | None
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """Return the first row of each group of rows in one cell, and each row's group; None where no two are in one.
+
+    Told by hashes: these are sorted in a third of the memory of rows, and in a tenth of the time.
+    """
+    hashed = _hashed(xyz, cell, rounding)
+    hashed.sort()
+    if not (hashed[1:] == hashed[:-1]).any():
+        return None
+    _, first, group = np.unique(_hashed(xyz, cell, rounding), return_index=True, return_inverse=True)
+    for axis in range(3):
+        of_rows = _column(xyz, axis, cell, rounding)
+        if not np.array_equal(of_rows, of_rows[first][group]):  # two cells have one hash
+            cells = np.stack([_column(xyz, each, cell, rounding) for each in range(3)], axis=1)
+            _, first, group = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+            break
+    return None if len(first) == len(xyz) else (first, group.reshape(-1))
+
+
+def _hashed(xyz: Floats, cell: float, rounding: np.ufunc | None) -> npt.NDArray[np.uint64]:
     hashed = np.zeros(len(xyz), dtype=np.uint64)
     for axis in range(3):
-        hashed *= np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits
-        hashed ^= (xyz[:, axis] + 0.0).view(np.uint64)  # -0.0 + 0.0 is 0.0
-    hashed.sort()
-    return bool((hashed[1:] == hashed[:-1]).any())
+        bits = _column(xyz, axis, cell, rounding).view(np.uint64)
+        bits ^= bits >> np.uint64(32)  # small whole numbers have theirs up there, and no product moves bits down
+        hashed *= _GOLDEN
+        hashed ^= bits
+    return hashed
+
+
+def _column(xyz: Floats, axis: int, cell: float, rounding: np.ufunc | None) -> Floats:
+    """Return a coordinate of each row's cell, or of the row itself; a new array."""
+    if rounding is None:
+        return xyz[:, axis] + 0.0  # -0.0 + 0.0 is 0.0
+    with np.errstate(over="ignore"):  # where rows do not differ, but for less than their last bit
+        column: Floats = xyz[:, axis] / cell
+    rounding(column, out=column)
+    column += 0.0
+    return column

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ import torch
 from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
+from straightpcf.model.cpus import usable_cpus
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
@@ -48,8 +48,9 @@ def load_filter(
 ) -> Filter:
     """Load a network, the shipped one by default, onto "cpu", "cuda" or the better one present ("auto").
 
-    threads: CPU threads, all cores by default; the result does not depend on it. tile_points: see Filter. Raises
-    DeviceUnavailable for a device that is not here, MalformedFile for weights that do not fit, InvalidOptions.
+    threads: CPU threads, by default one for each CPU that is usable here; the result does not depend on it.
+    tile_points: see Filter. Raises DeviceUnavailable for a device that is not here, MalformedFile for weights that do
+    not fit, InvalidOptions.
     """
     chosen = device_named(device)
     path = DEFAULT_WEIGHTS if weights is None else weights
@@ -115,7 +116,7 @@ class Filter:
         self.network = network.eval().requires_grad_(requires_grad=False)
         self.calibration = calibration or Calibration()
         self.device = device
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = threads or usable_cpus()
         self.coverage = coverage
         self.euler_steps = euler_steps
         self.full_evaluations = full_evaluations

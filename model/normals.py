@@ -13,12 +13,12 @@ _CHUNK = 50_000
 
 
 def recompute_normals(
-    xyz: npt.NDArray[np.float64], old: npt.NDArray[np.float64], *, neighbours: int = NEIGHBOURS
+    xyz: npt.NDArray[np.float64], old: npt.NDArray[np.float64], *, neighbours: int = NEIGHBOURS, workers: int = 1
 ) -> npt.NDArray[np.float64]:
     """Return unit normals (N, 3) float64 of points (N, 3): the direction in which their neighbours spread least.
 
     old: (N, 3), says which of the two directions is meant; where it is zero or not finite the choice is arbitrary.
-    Rows whose position is not finite keep the old one.
+    Rows whose position is not finite keep the old one. workers: threads that look up neighbours.
     """
     out = old.copy()
     rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
@@ -28,7 +28,7 @@ def recompute_normals(
     tree = cKDTree(here)
     for start in range(0, len(rows), _CHUNK):
         some = slice(start, start + _CHUNK)
-        _, index = tree.query(here[some], k=min(neighbours, len(rows)), workers=-1)
+        _, index = tree.query(here[some], k=min(neighbours, len(rows)), workers=workers)
         spread = here[index] - here[index].mean(axis=1, keepdims=True)  # (n, k, 3)
         largest = np.abs(spread).max(axis=(1, 2), keepdims=True)
         spread /= np.where(largest > 0, largest, 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.distinct import Distinct
+from straightpcf.model.distinct import half_reach
 from straightpcf.model.normalize import CloudFrame, is_scene
 from straightpcf.model.patches import PATCH_SIZE
 
@@ -14,7 +14,7 @@ __all__ = ["FAR_OUT", "far_out", "isolated"]
 
 # A row so many times as far out as half of the rows are is a file's sign for "no data". With it, float64 would hold all
 # others in one place.
-FAR_OUT, _SOME = 1e12, 10_000
+FAR_OUT = 1e12
 
 _AROUND = 8  # neighbours: what lies in a group of more belongs to something
 # How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
@@ -35,11 +35,9 @@ _BLOCK = 2**16  # points whose neighbours are held at once
 def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
     none = np.zeros(len(xyz), dtype=bool)
-    some = Distinct(xyz[:: max(1, len(xyz) // _SOME)]).xyz  # where many rows say "no data", all say the same
-    if len(some) == 0:
+    if len(xyz) == 0:
         return none
-    middle = np.median(some / 2, axis=0)  # halves: a difference may overflow
-    reach = np.median(np.abs(some / 2 - middle).max(axis=1))
+    middle, reach = half_reach(xyz)
     ends = np.stack([xyz.min(axis=0), xyz.max(axis=0)]) / 2
     if reach == 0 or np.abs(ends - middle).max() / FAR_OUT <= reach:
         return none

@@ -53,12 +53,15 @@ class Patches:
         return cls(*(np.concatenate(field) for field in fields))
 
 
-def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE) -> Patches:
+def cut_patches(
+    xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, patch_size: int = PATCH_SIZE, workers: int = 1
+) -> Patches:
     """Cut (N, 3) float64 points into patches that cover every one of them.
 
     coverage: how many patches a point is in on average, at the start; farthest-point seeds are added in what
     is left uncovered until nothing is. A point's owner is the patch to whose seed it is nearest in units of
-    that patch's radius (the first of equals). `seed` picks the first seed. Memory is O(coverage N).
+    that patch's radius (the first of equals). `seed` picks the first seed. workers: threads that look up
+    neighbours. Memory is O(coverage N).
     """
     count = len(xyz)
     size = min(patch_size, count)
@@ -66,13 +69,13 @@ def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, pat
     tree = cKDTree(xyz)
     wanted = 1 if count <= patch_size else max(1, int(np.ceil(coverage * count / size)))
     seeds = _farthest(xyz, wanted, first)
-    distance, index = _nearest(tree, xyz[seeds], size)
+    distance, index = _nearest(tree, xyz[seeds], size, workers)
     covered = np.zeros(count, dtype=bool)
     covered[index] = True
     while not covered.all():
         left = np.flatnonzero(~covered)
         more = left[_farthest(xyz[left], max(1, int(np.ceil(2 * len(left) / size))), 0)]
-        more_distance, more_index = _nearest(tree, xyz[more], size)
+        more_distance, more_index = _nearest(tree, xyz[more], size, workers)
         # Among equal points the tree may leave out the seed itself; it must be in its own patch.
         absent = ~(more_index == more[:, None]).any(axis=1)
         more_index[absent, -1] = more[absent]
@@ -84,9 +87,9 @@ def cut_patches(xyz: npt.NDArray[np.float64], *, coverage: float, seed: int, pat
     return Patches(seeds, _first(index, owns), owns.sum(axis=1), distance[:, -1].astype(np.float64))
 
 
-def patches_around(tree: cKDTree, seeds: npt.NDArray[np.float64], patch_size: int) -> Patches:
+def patches_around(tree: cKDTree, seeds: npt.NDArray[np.float64], patch_size: int, *, workers: int = 1) -> Patches:
     """Return the `patch_size` nearest points of a tree to each of (M, 3) seeds, as patches that own nothing."""
-    distance, index = _nearest(tree, seeds, patch_size)
+    distance, index = _nearest(tree, seeds, patch_size, workers)
     radii = distance[:, -1].astype(np.float64)
     return Patches(index[:, 0].astype(np.int64), index, np.zeros(len(seeds), dtype=np.int64), radii)
 
@@ -109,9 +112,9 @@ def _farthest(xyz: npt.NDArray[np.float64], wanted: int, first: int) -> npt.NDAr
 
 
 def _nearest(
-    tree: cKDTree, queries: npt.NDArray[np.float64], size: int
+    tree: cKDTree, queries: npt.NDArray[np.float64], size: int, workers: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    distance, index = tree.query(queries, k=np.arange(1, size + 1), workers=-1)
+    distance, index = tree.query(queries, k=np.arange(1, size + 1), workers=workers)
     return distance.astype(np.float32), index.astype(np.int32)
 
 

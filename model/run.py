@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.distinct import Distinct
+from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, far_out, isolated
@@ -76,14 +76,14 @@ class Run:
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
-        self.far_out = len(xyz) - self.not_finite - len(self.rows)
+        self.far_out_count = len(xyz) - self.not_finite - len(self.rows)
         if len(self.rows) < MIN_POINTS:
-            others = f"{self.not_finite} not finite, {self.far_out} far out"
+            others = f"{self.not_finite} not finite, {self.far_out_count} far out"
             raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
         self._take()
         apart = self._apart()
-        self.apart = int(apart.sum())
-        if self.apart:
+        self.apart_count = int(apart.sum())
+        if self.apart_count:
             self.rows = self.rows[~apart]
             self._take()
         self.iterations, self._progress = 0, 0.0
@@ -99,7 +99,7 @@ class Run:
     def _take(self) -> None:
         cloud = self._of_rows()
         self.frame = CloudFrame.of(cloud)
-        self.points = Distinct(cloud)
+        self.points = Distinct(cloud, cell=cell_of(cloud))
 
     def _apart(self) -> npt.NDArray[np.bool_]:
         """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
@@ -109,8 +109,8 @@ class Run:
         return apart[self.points.inverse]
 
     def patches(self) -> Iterator[FinishedPatch]:
-        """Run pass after pass."""
-        if self.frame.radius == 0.0:
+        """Run pass after pass; none where there is nothing to tell noise from."""
+        if len(self.points.xyz) < MIN_POINTS:
             return
         planned = None if self.options.iterations == "auto" else self.options.iterations
         tiles = split(self.points.xyz, self.filter.tile_points)
@@ -132,18 +132,22 @@ class Run:
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
         out = self.xyz.copy()
-        out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
+        if self.iterations:  # else even the sign of a zero stays
+            out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
         warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
-        if self.far_out:
+        if self.far_out_count:
             farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
-            warnings.append(f"{self.far_out} points are {farther} and were passed through")
-        if self.apart:
-            warnings.append(f"{self.apart} points lie apart from all others and were passed through")
+            warnings.append(f"{self.far_out_count} points are {farther} and were passed through")
+        if self.apart_count:
+            warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
         if held := np.count_nonzero(self.held[self.points.inverse]):
             warnings.append(f"{held} points are on walls closer together than points are, and were held back")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
+        elif len(self.points.xyz) < MIN_POINTS:
+            places = f"all points lie in {len(self.points.xyz)} places"
+            warnings.append(f"{places}: nothing is filtered where they are fewer than {MIN_POINTS}")
         elif len(self.points.xyz) < _FEW_POINTS:
             warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
         noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
@@ -240,7 +244,14 @@ class Run:
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
         owner = self.filter
         tiles = tiles or split(xyz, owner.tile_points)
-        return Tiling(xyz, tiles, coverage=owner.coverage, seed=self.options.seed, device=owner.device)
+        return Tiling(
+            xyz,
+            tiles,
+            coverage=owner.coverage,
+            seed=self.options.seed,
+            device=owner.device,
+            workers=owner.threads,
+        )
 
 
 def _numbers(xyz: npt.ArrayLike) -> npt.NDArray[np.float64]:

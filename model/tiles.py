@@ -45,7 +45,7 @@ class Tiling:
 
     One tile is the whole cloud, cut as `cut_patches` does. Of several, each is cut together with its halo, the
     points around it that its patches reach; a point's owner is always a patch of its own tile's cut.
-    For a device the cuts are kept: spreading reads them again.
+    For a device the cuts are kept: spreading reads them again. workers: threads of the CPU that look up neighbours.
     """
 
     def __init__(
@@ -56,12 +56,14 @@ class Tiling:
         coverage: float,
         seed: int,
         device: str = "cpu",
+        workers: int = 1,
     ) -> None:
-        self._xyz, self.tiles = xyz, tiles
-        cut = cut_patches if device == "cpu" else partial(cut_patches_on, torch.device(device))
+        self._xyz, self.tiles, self._workers = xyz, tiles, workers
+        on_host = device == "cpu"
+        cut = partial(cut_patches, workers=workers) if on_host else partial(cut_patches_on, torch.device(device))
         self._cut: Callable[[npt.NDArray[np.float64]], Patches] = partial(cut, coverage=coverage, seed=seed)
         self._margins: list[float] = []
-        self._kept: list[Patches] | None = None if device == "cpu" else []
+        self._kept: list[Patches] | None = None if on_host else []
 
     @cached_property
     def whole(self) -> Patches | None:
@@ -91,7 +93,7 @@ class Tiling:
         for core in self.tiles:
             share = max(2, round(count * len(core) / len(self._xyz)))
             seeds = core[np.linspace(0, len(core) - 1, share).astype(np.int64)]
-            patches = patches_around(cKDTree(self._xyz[core]), self._xyz[seeds], PATCH_SIZE)
+            patches = patches_around(cKDTree(self._xyz[core]), self._xyz[seeds], PATCH_SIZE, workers=self._workers)
             self._margins.append(_HALO_RADII * float(np.percentile(patches.radii, _SPARSEST)))
             found.append(patches.of_rows(core))
         return Patches.joined(found), range(0)

@@ -48,7 +48,7 @@ class Settings:
     allowed_hosts: comma-separated names by which a server without keys on loopback may be asked beside loopback's own.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
-    weights: None for the shipped ones.  threads: None for one for each CPU.
+    weights: None for the shipped ones.  threads: None for one for each CPU it may use.
     tile_points: of a cloud, cut into patches at once; None for the filter's own default.
     shutdown_seconds: how long running requests may finish after SIGTERM.
     """

@@ -15,6 +15,7 @@ import torch
 from benchmarks import scenes
 from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
+from straightpcf.model.kernels import cpu
 from tests.clouds import sphere
 
 ROOT = Path(__file__).parent.parent
@@ -74,6 +75,27 @@ def test_speed() -> None:
 def test_scaling() -> None:
     rows = [line.split() for line in printed("scaling", "--points", 500, 1000, "--threads", 1).splitlines()[2:]]
     assert [row[0] for row in rows] == ["500", "1000"]
+
+
+def test_passes(tmp_path: Path) -> None:
+    clouds = {f"{name}/1000": sphere(1000) for name in "abcde"}
+    clouds |= {f"f/{count}": sphere(count) for count in (10_000, 50_000)}  # the one held out
+    np.savez(tmp_path / "shapes.npz", **clouds)
+    options = ("--noise", 0.02, "--passes", 1, "--threads", 1, "--data", tmp_path / "shapes.npz")
+    _, row = printed("passes", DEFAULT_WEIGHTS, *options).splitlines()
+    noise, number, chamfer, across, sunk = map(float, row.split()[1:])
+    assert (noise, number) == (0.02, 1)
+    assert chamfer > across > sunk
+    assert 0 < across < 4  # the noise's own is 4
+
+
+def test_kernels_that_cannot_be_compiled_are_not_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if cpu._SHIPPED.is_dir():
+        pytest.skip("the kernels are shipped here")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))  # no compiler
+    _, *rows = printed("kernels", "--every-set").splitlines()
+    assert [row.split(maxsplit=1) for row in rows] == [[name, "not compiled"] for name in cpu.instruction_sets()]
 
 
 def test_scenes(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -81,12 +82,8 @@ def load() -> ctypes.CDLL | None:
         return None
     failed: Exception | None = None
     for name in instruction_sets():  # a compiler may be older than the processor
-        for folder in (_SHIPPED, _cache()):
-            path = folder / _file_name(name)
-            if path.is_file():
-                return _open(path)
         try:
-            library = _open(build(_cache(), name))
+            library = _found(name) or _open(build(_cache(), name))
         except (OSError, subprocess.SubprocessError) as exc:
             failed = failed or exc
             continue
@@ -94,6 +91,18 @@ def load() -> ctypes.CDLL | None:
             warnings.warn(f"CPU kernels compiled for {name} only, which is slower here ({failed})", stacklevel=2)
         return library
     warnings.warn(f"CPU kernels not compiled ({failed}); plain torch is used, several times slower", stacklevel=2)
+    return None
+
+
+def _found(target_set: str) -> ctypes.CDLL | None:
+    """Open what was shipped or built before; None where there is none, or it is cut short or made for another libc."""
+    name = _file_name(target_set)
+    with suppress(OSError):
+        if (shipped := _SHIPPED / name).is_file():
+            return _open(shipped)
+    with suppress(OSError):
+        if (built := _cache() / name).is_file():
+            return _open(built)
     return None
 
 
@@ -119,7 +128,11 @@ def build(folder: Path, target_set: str) -> Path:
 
 
 def _cache() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    """Return the user's folder; raises OSError where there is no home, as of a container's user without a name."""
+    try:
+        root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError as exc:
+        raise OSError(f"{exc} Set HOME or XDG_CACHE_HOME") from exc
     return Path(root) / "straightpcf"
 
 
@@ -130,15 +143,18 @@ def build_all(folder: Path) -> list[Path]:
 
 def _file_name(target_set: str) -> str:
     read = b"".join(path.read_bytes() for path in _SOURCES + _HEADERS)
-    digest = hashlib.sha256(read + _FLAGS.encode()).hexdigest()[:12]
+    flags = f"{_FLAGS} {_compiled_sets()[target_set]}"
+    digest = hashlib.sha256(read + flags.encode()).hexdigest()[:12]
     return f"kernels-{platform.machine()}-{target_set}-{digest}.so"
 
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused", "pack_coarse", "pack_linear"):
-        getattr(library, f"straightpcf_{name}").restype = None
-    library.straightpcf_products_are_bf16.restype = ctypes.c_int
+        try:
+            getattr(library, f"straightpcf_{name}").restype = None
+        except AttributeError as exc:
+            raise OSError(f"{path} has other functions: {exc}") from exc
     return library
 
 

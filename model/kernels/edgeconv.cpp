@@ -206,13 +206,4 @@ void straightpcf_edge_max_backward(const float* grad, const uint8_t* arg, const 
   }
 }
 
-// 1 where the products are bfloat16.
-int straightpcf_products_are_bf16() {
-#if defined(__AVX512BF16__)
-  return 1;
-#else
-  return 0;
-#endif
-}
-
 }  // extern "C"

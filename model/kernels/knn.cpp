@@ -56,6 +56,12 @@ inline void distances_by_products(const float* panels, const float* squares, int
   }
 }
 
+// One point that is not finite shall not make all distances so.
+inline void keep_numbers(std::vector<float>& mean) {
+  for (float& x : mean)
+    if (!(x > -FAR && x < FAR)) x = 0;
+}
+
 // What `select` needs beside its arguments: the candidates of one query, a vector longer than a patch.
 struct Candidates {
   std::vector<float> distance;
@@ -89,7 +95,7 @@ inline Threshold threshold(const float* values, int vectors, int k, int spare, T
   return high;
 }
 
-// Indices of the k smallest distances (ties go to the lower index), in no particular order.
+// Indices of the k smallest distances (ties go to the lower index), in no particular order; of none that is a number: 0.
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates.
 inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
   int32_t bound = bits_of(FAR);
@@ -97,8 +103,8 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
     float least[GROUPS];
     __m512 most = _mm512_setzero_ps();
     for (int g = 0; g < GROUPS; g += LANES) {
-      __m512 m = _mm512_loadu_ps(distance + g);
-      for (int j = g + GROUPS; j < padded; j += GROUPS) m = _mm512_min_ps(m, _mm512_loadu_ps(distance + j));
+      __m512 m = _mm512_set1_ps(FAR);
+      for (int j = g; j < padded; j += GROUPS) m = _mm512_min_ps(_mm512_loadu_ps(distance + j), m);  // m of NaN and m
       m = _mm512_max_ps(m, _mm512_setzero_ps());  // rounding may leave less than nothing, which orders the other way
       _mm512_storeu_ps(least + g, m);
       most = _mm512_max_ps(most, m);
@@ -114,6 +120,10 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
     const __mmask16 chosen = _mm512_cmple_epi32_mask(d, limit) & _mm512_cmplt_epi32_mask(d, far);
     _mm512_storeu_si512(&near.index[count], _mm512_maskz_compress_epi32(chosen, index));
     count += __builtin_popcount(chosen);
+  }
+  if (count == 0) {  // NaN, which then comes of them whatever the neighbours
+    std::fill(out, out + k, 0);
+    return;
   }
   const int vectors = (count + LANES - 1) / LANES;
   for (int n = 0; n < vectors; ++n)
@@ -145,15 +155,15 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
 
 #else
 
-// Indices of the k smallest distances (ties go to the lower index), in no particular order.
+// Indices of the k smallest distances (ties go to the lower index), in no particular order; of none that is a number: 0.
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few keys.
 inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
   float bound = FAR;
   if (k <= GROUPS) {
     float least[GROUPS];
     for (int g = 0; g < GROUPS; g += LANES) {
-      vec m = load(distance + g);
-      for (int j = g + GROUPS; j < padded; j += GROUPS) {
+      vec m = splat(FAR);  // NaN is less than nothing, and would put nth_element out of order
+      for (int j = g; j < padded; j += GROUPS) {
         const vec d = load(distance + j);
         m = d < m ? d : m;
       }
@@ -166,6 +176,10 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   for (int j = 0; j < padded; ++j)
     if (distance[j] <= bound && distance[j] < FAR)
       near.keys[count++] = (uint64_t(bits_of(std::max(distance[j], 0.0f))) << 32) | uint32_t(j);
+  if (count == 0) {  // NaN, which then comes of them whatever the neighbours
+    std::fill(out, out + k, 0);
+    return;
+  }
   const auto begin = near.keys.begin();
   if (count > k) std::nth_element(begin, begin + k, begin + count);
   else std::sort(begin, begin + count);
@@ -185,6 +199,7 @@ class Products {
     std::vector<float> mean((size_t)steps_ * DEPTH, 0.0f);  // squares of what all have in common would swallow the rest
     for (int i = 0; i < count; ++i)
       for (int d = 0; d < dims; ++d) mean[d] += points[(size_t)i * dims + d] / count;
+    keep_numbers(mean);
     const __m512 twice = _mm512_set1_ps(-2.0f);
     for (int i = 0; i < count; ++i) {
       __m512 squares = _mm512_setzero_ps();
@@ -280,6 +295,7 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
   std::vector<float> mean(dims, 0.0f), squares(padded, 0.0f);
   for (int i = 0; many && i < count; ++i)  // squares of what all have in common would swallow the rest
     for (int d = 0; d < dims; ++d) mean[d] += points[(size_t)i * dims + d] / count;
+  keep_numbers(mean);
   std::vector<float> panels((size_t)padded * dims, 0.0f), from((size_t)padded * dims, 0.0f);
   for (int i = 0; i < count; ++i)
     for (int d = 0; d < dims; ++d) {

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame, zoom_of
 from straightpcf.model.normals import recompute_normals
+from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.points.errors import InvalidOptions, MalformedFile, TooFewPoints
 
 __all__ = [
@@ -34,7 +35,6 @@ __all__ = [
     "NOISE_STD",
     "OTHER_NOISE",
     "PASSED",
-    "PATCH_SIZE",
     "REACH",
     "SCALES",
     "STRETCH",
@@ -53,7 +53,6 @@ __all__ = [
     "reach_of",
 ]
 
-PATCH_SIZE = 1000
 NOISE_STD = 0.02  # of x_0, in the frame in which the network sees a patch
 EARLIEST = -0.5  # paths are taken up at times from here to 1: x_t has noise from 3 % down
 SCALES = (0.8, 1.2)  # augmentation

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train.data import (
     ALONG_BEAMS,
     AROUND,
@@ -22,7 +23,6 @@ from straightpcf.model.train.data import (
     NOISE_STD,
     OTHER_NOISE,
     PASSED,
-    PATCH_SIZE,
     REACH,
     SCALES,
     STRETCH,

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train.data import (
-    PATCH_SIZE,
     REACH,
     SCALES,
     TOUCH_UNTIL,

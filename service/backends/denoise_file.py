@@ -73,7 +73,7 @@ def denoise_file(
     was_filtered = time.monotonic()
     clean = cloud.with_xyz(result.xyz)
     if job.options.normals == "recompute":
-        clean = clean.with_normals(recompute_normals(clean.xyz, clean.old_normals()))
+        clean = clean.with_normals(recompute_normals(clean.xyz, clean.old_normals(), workers=denoiser.threads))
     write_cloud(clean, job.target, target_format)
     size, sha256 = _settle(job.target)
     ended = time.monotonic()

@@ -95,12 +95,82 @@ def test_a_compiler_older_than_the_processor_compiles_for_an_older_one(
     monkeypatch.delenv("STRAIGHTPCF_NO_KERNELS", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(cpu, "_SHIPPED", tmp_path)
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(cpu, "instruction_sets", lambda: ("amx_bf16", "avx512_bf16", "avx2", "generic"))
     monkeypatch.setattr(cpu, "build", build)
     monkeypatch.setattr(cpu, "_open", lambda path: path.name)
     with pytest.warns(UserWarning, match=r"for avx2 only, which is slower here \(c\+\+: error: .* for amx_bf16\)"):
         assert cpu.load.__wrapped__() == "compiled.so"
     assert tried == ["amx_bf16", "avx512_bf16", "avx2"]
+
+
+@pytest.fixture
+def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Nothing is shipped, and what is built comes to a folder of the test's."""
+    monkeypatch.delenv("STRAIGHTPCF_NO_KERNELS", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cpu, "_SHIPPED", tmp_path / "shipped")
+    monkeypatch.setattr(cpu, "instruction_sets", lambda: ("generic",))
+    return tmp_path / "straightpcf"
+
+
+@pytest.mark.skipif(cpu.load() is None, reason="no C++ compiler and no shipped kernels")
+@pytest.mark.parametrize("kept", [b"", b"\x7fELF of another machine", b"#!/bin/sh\n"])
+def test_a_library_that_does_not_open_is_compiled_again(
+    kept: bytes, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = cpu.load()
+    path = own_cache / cpu._file_name("generic")
+    path.parent.mkdir()
+    path.write_bytes(kept)
+
+    def build(folder: Path, name: str) -> Path:
+        shutil.copy(good._name, folder / "built.so")  # what compiling gives, in less time
+        return (folder / "built.so").replace(folder / cpu._file_name(name))
+
+    monkeypatch.setattr(cpu, "build", build)
+    assert cpu.load.__wrapped__()._name == str(path)
+
+
+def test_where_a_library_neither_opens_nor_compiles_torch_does_the_work(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own_cache.mkdir()
+    (own_cache / cpu._file_name("generic")).write_bytes(b"no library")
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    with pytest.warns(UserWarning, match=r"not compiled \(no C\+\+ compiler: install g\+\+\); plain torch is used"):
+        assert cpu.load.__wrapped__() is None
+
+
+def test_a_library_with_other_functions_is_none_of_ours(own_cache: Path) -> None:
+    foreign = torch.__file__.replace("__init__.py", "lib/libshm.so")
+    if not Path(foreign).is_file():
+        pytest.skip("no library to try it with")
+    with pytest.raises(OSError, match="has other functions"):
+        cpu._open(Path(foreign))
+
+
+def test_a_user_without_a_home_gets_what_is_shipped_or_torch(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`docker run --user 12345` where no HOME is set."""
+
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.warns(UserWarning, match=r"determine home directory\. Set HOME .*; plain torch is used"):
+        assert cpu.load.__wrapped__() is None
+    cpu._SHIPPED.mkdir()
+    (cpu._SHIPPED / cpu._file_name("generic")).touch()
+    monkeypatch.setattr(cpu, "_open", lambda path: path)
+    assert cpu.load.__wrapped__().parent == cpu._SHIPPED
+
+
+def test_other_flags_of_a_set_are_another_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    names = {cpu._file_name(name) for name in cpu._X86}
+    monkeypatch.setattr(cpu, "_X86", {name: f"{flags} -mtune=native" for name, flags in cpu._X86.items()})
+    assert names.isdisjoint(cpu._file_name(name) for name in cpu._X86)
 
 
 @pytest.mark.slow

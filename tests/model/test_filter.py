@@ -171,6 +171,29 @@ def test_equal_points_come_back_as_they_are_with_a_warning(tiny: Filter) -> None
     assert "coincide" in result.warnings[0]
 
 
+@pytest.mark.parametrize("distinct", [2, 6, 32])
+@pytest.mark.parametrize("iterations", [2, "auto"])
+def test_few_places_with_many_points_each_come_back_exactly_with_a_warning(
+    tiny: Filter, distinct: int, iterations: Any
+) -> None:
+    places = noisy(torus(distinct), 0.01)
+    places[0, 2] = -0.0
+    cloud = np.tile(places, (20, 1))
+    options = DenoiseOptions(iterations=iterations)
+    assert list(tiny.patches(cloud, options)) == []
+    result = tiny.denoise(cloud, options)
+    assert result.xyz.tobytes() == cloud.tobytes()
+    assert result.iterations == 0
+    (warning,) = result.warnings
+    assert warning == f"all points lie in {distinct} places: nothing is filtered where they are fewer than 33"
+
+
+def test_as_many_places_as_a_patch_has_at_least_are_filtered(tiny: Filter) -> None:
+    result = tiny.denoise(np.tile(noisy(torus(MIN_POINTS), 0.01), (3, 1)), ONE_PASS)
+    assert result.iterations == 1
+    assert np.isfinite(result.xyz).all()
+
+
 def test_points_in_one_place_move_together_and_cost_no_patches(tiny: Filter) -> None:
     """A depth camera writes its invalid pixels as zeros: thousands of equal points."""
     cloud = np.concatenate([noisy(torus(1500), 0.01), np.zeros((6000, 3))])

@@ -7,6 +7,7 @@ import torch
 
 from straightpcf.model import ops
 from straightpcf.model.kernels import cpu
+from straightpcf.model.nets.straightpcf import VelocityModule
 
 kernels = pytest.mark.skipif(cpu.load() is None, reason="no C++ compiler and no shipped kernels")
 
@@ -57,6 +58,40 @@ def test_knn_of_equal_points_stays_in_range() -> None:
     index = ops.knn(torch.zeros(1, 200, 3), 32)
     assert index.min() >= 0
     assert index.max() < 200
+
+
+@kernels
+@pytest.mark.parametrize("dims", [3, 32])
+def test_a_point_that_is_no_number_is_nobody_s_neighbour(dims: int) -> None:
+    x = torch.randn(1, 200, dims, generator=torch.Generator().manual_seed(dims))
+    x[0, 7] = torch.nan
+    found = ops.knn(x, 32)
+    others = torch.arange(200) != 7
+    assert (found[0, 7] == 0).all()
+    assert (found[0, others] != 7).all()
+    expected = ops.knn_torch(x[:, others], 32, 199)  # its own cdist has no order for NaN
+    assert (found[0, others].sort().values == torch.arange(200)[others][expected[0]].sort().values).all()
+
+
+@kernels
+@pytest.mark.parametrize("count", [2, 34, 64, 200])
+@pytest.mark.parametrize("dims", [3, 32])
+@pytest.mark.parametrize("value", [torch.nan, -torch.nan, torch.inf, 3e38])
+def test_of_points_that_are_no_numbers_neighbours_stay_in_range(value: float, dims: int, count: int) -> None:
+    found = ops.knn(torch.full((1, count, dims), value), 32)
+    assert found.min() >= 0
+    assert found.max() < count
+
+
+@kernels
+@pytest.mark.parametrize("grad", [False, True])  # in one call of the kernels, and block by block
+def test_a_network_of_nan_says_nan(*, grad: bool) -> None:
+    module = VelocityModule().eval()
+    with torch.no_grad():
+        for tensor in module.parameters():
+            tensor.fill_(torch.nan)
+    with torch.set_grad_enabled(grad):
+        assert module(torch.randn(1, 100, 3)).isnan().all()
 
 
 @kernels

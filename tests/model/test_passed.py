@@ -11,8 +11,9 @@ import torch
 
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train import train
-from straightpcf.model.train.data import PASSED, PATCH_SIZE, PatchSource, held_out_shapes
+from straightpcf.model.train.data import PASSED, PatchSource, held_out_shapes
 from straightpcf.model.train.device_data import DevicePatchSource
 from straightpcf.model.train.losses import across, precision
 from straightpcf.model.train.passed import PassedClouds, training_patches

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train.data import EARLIEST, NOISE_STD, PATCH_SIZE, Batch, PatchSource
+from straightpcf.model.patches import PATCH_SIZE
+from straightpcf.model.train.data import EARLIEST, NOISE_STD, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision
 from straightpcf.model.turns import turns

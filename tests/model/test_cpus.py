@@ -1,0 +1,60 @@
+"""As many threads as CPUs that the process may run on, not as the machine has."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from straightpcf.model.cpus import usable_cpus
+from straightpcf.model.filter import Filter
+from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.normals import recompute_normals
+from straightpcf.points.options import DenoiseOptions
+from tests.clouds import noisy, sphere, torus
+
+
+def test_a_process_that_is_held_to_some_cpus_has_those(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 6}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    assert usable_cpus() == 3
+    network = StraightPCF(width=16, distance_width=16)
+    assert Filter(network).threads == 3
+    assert Filter(network, threads=2).threads == 2
+
+
+@pytest.mark.parametrize(("there", "usable"), [(8, 8), (None, 1)])
+def test_where_the_system_cannot_say_all_are_taken(
+    there: int | None, usable: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: there)
+    assert usable_cpus() == usable
+
+
+def test_no_more_threads_look_up_neighbours_than_a_filter_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[int] = []
+
+    class Tree(cKDTree):  # type: ignore[misc]
+        def query(self, *args: object, workers: int = 1, **options: object) -> tuple[np.ndarray, np.ndarray]:
+            taken.append(workers)
+            return super().query(*args, workers=workers, **options)
+
+    for module in ("patches", "tiles", "spread", "outliers"):
+        monkeypatch.setattr(f"straightpcf.model.{module}.cKDTree", Tree)
+    network = StraightPCF(width=16, distance_width=16)
+    cloud, results = noisy(torus(11_000), 0.01), []
+    for threads in (1, 2):
+        taken.clear()
+        model = Filter(network, threads=threads, coverage=1, tile_points=10_000)
+        results.append(model.denoise(cloud, DenoiseOptions(iterations=1)).xyz)
+        assert max(taken) == threads
+        assert min(taken) >= 1
+    assert results[0].tobytes() == results[1].tobytes()
+
+
+def test_normals_do_not_depend_on_the_threads() -> None:
+    xyz = sphere(2000)
+    np.testing.assert_array_equal(recompute_normals(xyz, xyz, workers=2), recompute_normals(xyz, xyz))

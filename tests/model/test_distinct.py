@@ -1,0 +1,106 @@
+"""Points in one place, or nearly, are one to the network and move together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from straightpcf.model import distinct
+from straightpcf.model.distinct import Distinct, cell_of
+from straightpcf.model.filter import Filter, load_filter
+from tests.clouds import far_group, noisy, sphere, torus
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Filter:
+    return load_filter(device="cpu", threads=1)
+
+
+def near(xyz: np.ndarray) -> Distinct:
+    return Distinct(xyz, cell=cell_of(xyz))
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-310, 1e-300, 1.0, 1e300])
+def test_points_that_are_apart_stay_as_they_are(scale: float) -> None:
+    xyz = noisy(torus(20_000), 0.01) * (scale if scale > 1e-320 else 1.0)
+    if scale < 1e-320:
+        xyz = np.round(xyz * 1000) * scale  # multiples of the least number there is
+        xyz = np.unique(xyz, axis=0)[::-1]
+    found = near(xyz)
+    assert found.xyz is xyz
+    assert not found.repeated
+    np.testing.assert_array_equal(found.inverse, np.arange(len(xyz)))
+
+
+@settings(max_examples=30, deadline=None)
+@given(count=st.integers(1, 300), places=st.integers(1, 40), scale=st.sampled_from([0.0, 5e-324, 1e-300, 1.0, 1e307]))
+def test_equal_points_are_one_place_in_any_unit(count: int, places: int, scale: float) -> None:
+    rng = np.random.default_rng(count)
+    xyz = (rng.integers(-9, 10, (places, 3)) * scale)[rng.integers(0, places, count)]
+    expected, inverse = np.unique(xyz + 0.0, axis=0, return_inverse=True)
+    for found in (Distinct(xyz), near(xyz)):
+        np.testing.assert_array_equal(found.xyz, xyz if len(expected) == count else expected)
+        np.testing.assert_array_equal(found.xyz[found.inverse], xyz)
+        if len(expected) < count:
+            np.testing.assert_array_equal(found.inverse, inverse.reshape(-1))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.25, 1e4])  # many coordinates, or all, lie on a cell's border
+@pytest.mark.parametrize("jitter", [1e-12, 1e-9])
+def test_near_copies_are_one_place_on_borders_of_cells_too(jitter: float, offset: float) -> None:
+    sheet = np.stack([*np.meshgrid(*2 * [np.arange(64) / 64]), np.zeros((64, 64))], axis=-1).reshape(-1, 3) + offset
+    rows = np.random.default_rng(0).permutation(np.repeat(np.arange(len(sheet)), 3))
+    found = near(noisy(sheet[rows], jitter))
+    assert len(found.xyz) == len(sheet)
+    assert (np.diff(found.inverse[np.argsort(rows, kind="stable")].reshape(-1, 3), axis=1) == 0).all()
+
+
+def test_a_scan_and_its_float32_copy_are_one() -> None:
+    xyz = noisy(sphere(20_000), 0.01)
+    found = near(np.vstack([xyz, xyz.astype(np.float32)]))
+    assert len(found.xyz) < 1.005 * len(xyz)  # a border of both grids parts the others
+    assert (found.inverse[:20_000] == found.inverse[20_000:]).mean() > 0.995
+    assert len(np.unique(found.inverse[:20_000])) == len(xyz)
+
+
+def test_far_points_do_not_make_one_place_of_all_others() -> None:
+    cloud = np.vstack([noisy(torus(1200), 0.01), far_group(1e8)])
+    assert len(near(cloud).xyz) >= 1200
+
+
+def test_cells_are_told_apart_also_where_their_hashes_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz = noisy(np.repeat(torus(300), 3, axis=0), 1e-12)
+    expected = near(xyz)
+    monkeypatch.setattr(distinct, "_hashed", lambda xyz, *_: np.zeros(len(xyz), dtype=np.uint64))
+    found = near(xyz)
+    np.testing.assert_array_equal(found.xyz, expected.xyz)
+    np.testing.assert_array_equal(found.inverse, expected.inverse)
+    assert near(torus(300)).repeated is False
+
+
+def test_every_point_is_among_the_copies_of_its_place() -> None:
+    xyz = noisy(np.tile(torus(200), (3, 1)), 1e-10)
+    found = near(xyz)
+    copies = [found.copies(np.array([place], dtype=np.int32)) for place in range(len(found.xyz))]
+    assert np.array_equal(np.sort(np.concatenate(copies)), np.arange(600))
+    assert all((found.inverse[rows] == place).all() for place, rows in enumerate(copies))
+
+
+def test_near_copies_take_no_noise_away_from_the_filter(shipped: Filter) -> None:
+    """Each point three times: its copies would be its neighbours, and the surface be seen nowhere."""
+
+    def left(xyz: np.ndarray) -> float:
+        return float(np.sqrt(np.square(np.linalg.norm(xyz, axis=1) - 1).mean()))
+
+    cloud = np.unique(noisy(sphere(3000), 0.01), axis=0)  # in the order of places: another one has other patches
+    alone = shipped.denoise(cloud)
+    rows = np.random.default_rng(3).permutation(np.repeat(np.arange(3000), 3))
+    for jitter in (0.0, 1e-12, 1e-9):
+        copies = noisy(cloud[rows], jitter)
+        result = shipped.denoise(copies)
+        assert left(result.xyz) == pytest.approx(left(alone.xyz), rel=0.05)
+        assert result.noise_before == pytest.approx(alone.noise_before, rel=0.05)
+        moved = (result.xyz - copies)[np.argsort(rows, kind="stable")].reshape(-1, 3, 3)
+        np.testing.assert_allclose(moved, moved[:, :1].repeat(3, axis=1), atol=1e-15)  # row i is still row i
