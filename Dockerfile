@@ -36,8 +36,9 @@ RUN if [ "$TORCH" != cpu ]; then \
 LABEL org.opencontainers.image.title="straightpcf" \
       org.opencontainers.image.description="Point-cloud denoising as a service" \
       org.opencontainers.image.licenses="MIT"
+# Group 0 may write /data, too: OpenShift gives a container a user of its own, in that group.
 RUN useradd --create-home --uid 10001 straightpcf \
-    && install -d -o straightpcf /data
+    && install -d -o straightpcf -g 0 -m 0770 /data
 COPY --from=build /venv /venv
 USER 10001
 ENV PATH=/venv/bin:$PATH \
@@ -47,7 +48,8 @@ ENV PATH=/venv/bin:$PATH \
     STRAIGHTPCF_GRPC_PORT=50051
 VOLUME /data
 EXPOSE 8000 50051
+# Not by urllib, which would ask the proxy that Docker may put into the environment.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
-    CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/readyz', timeout=2)"]
+    CMD ["python", "-c", "from http.client import *; c = HTTPConnection('127.0.0.1', 8000, timeout=2); c.request('GET', '/readyz'); exit(c.getresponse().status != 200)"]
 ENTRYPOINT ["straightpcf"]
 CMD ["serve", "--host", "0.0.0.0", "--port", "8000"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 __all__ = ["main"]
@@ -9,6 +10,8 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; the console script `straightpcf`."""
+    # Until somebody else takes it: the first process of a container is not told of signals that nobody handles.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from straightpcf.clients import cli
     except KeyboardInterrupt:

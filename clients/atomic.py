@@ -24,6 +24,12 @@ def check_target(path: Path) -> None:
         raise FileNotFoundError(f"{path} is a link to {path.readlink()}, in a folder that is not there")
     if path.exists() and not path.is_file():  # /dev/null, too, would be taken away
         raise FileExistsError(f"{path} is there and is no file: a result cannot take its place")
+    probe = _beside(_target(path))
+    try:  # which a read-only disk lets nobody, whatever the folder's mode says
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        probe.unlink()
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, os.fspath(path.parent)) from None
 
 
 @contextmanager
@@ -47,7 +53,7 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
     check_target(path)
     target = _target(path)
     mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
-    unfinished = target.with_name(f".{target.stem[:_NAME]}.{uuid.uuid4().hex[:12]}.part{target.suffix[:_NAME]}")
+    unfinished = _beside(target)
     # Nobody who may not read the result can read it while it is written; a read-only one has to be written, too.
     os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else mode | stat.S_IWUSR))
     try:
@@ -61,6 +67,10 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
         _sync_folder(target.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _beside(target: Path) -> Path:
+    return target.with_name(f".{target.stem[:_NAME]}.{uuid.uuid4().hex[:12]}.part{target.suffix[:_NAME]}")
 
 
 def _sync_folder(folder: Path) -> None:

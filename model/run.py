@@ -90,6 +90,7 @@ class Run:
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held = np.zeros(len(self.moved), dtype=bool)
         self.readings: list[Reading] = []  # before each pass, and after the last
+        self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
     def _of_rows(self) -> npt.NDArray[np.float64]:
@@ -124,6 +125,7 @@ class Run:
             self.readings.append(self.reader.read(here, tiling, self.readings[0] if self.readings else None))
             left = self._passes_left(planned)
             if left == 0:
+                self.noise_after = self._noise_left(tiles)
                 return
             self.iterations += 1
             self.moved += evened
@@ -150,10 +152,17 @@ class Run:
             warnings.append(f"{places}: nothing is filtered where they are fewer than {MIN_POINTS}")
         elif len(self.points.xyz) < _FEW_POINTS:
             warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
-        noise = [self.frame.radius * reading.noise_std for reading in self.readings] or [0.0]
-        return DenoiseResult(
-            out, self.iterations, noise[0], noise[-1], self.distances, untouched, seconds, tuple(warnings)
-        )
+        before = self.frame.radius * (self.readings[0].noise_std if self.readings else 0.0)
+        after = self.frame.radius * self.noise_after
+        return DenoiseResult(out, self.iterations, before, after, self.distances, untouched, seconds, tuple(warnings))
+
+    def _noise_left(self, tiles: list[npt.NDArray[np.int64]]) -> float:
+        """Return the noise std of what comes out: of points that go a part of their way, read once more."""
+        first, strength = self.readings[0], self.options.strength
+        if strength in (0.0, 1.0):
+            return (self.readings[-1] if strength else first).noise_std
+        here = self.frame.enter(self.points.xyz) + strength * self.moved
+        return self.reader.read(here, self._tiling(here, tiles), first).noise_std
 
     @property
     def distances(self) -> tuple[float, ...]:

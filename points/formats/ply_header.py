@@ -155,7 +155,8 @@ def _element(words: list[str], before: Collection[str], where: str) -> tuple[str
 def _property(words: list[str], order: str, before: Collection[str], where: str) -> PlyProperty:
     is_list = words[1:2] == ["list"]
     if len(words) != (5 if is_list else 3):
-        raise MalformedFile(f"{where}: a property has a type and a name, a list a second type, not {words[1:6]}")
+        said = [word[:40] for word in words[1:6]]
+        raise MalformedFile(f"{where}: a property has a type and a name, a list a second type, not {said}")
     for kind in words[2:4] if is_list else words[1:2]:
         if kind not in _TYPES:
             raise MalformedFile(f"{where}: {kind[:40]!r} is no PLY type")

@@ -175,7 +175,8 @@ def busy(error: OSError) -> ServerBusy | None:
 
 
 async def _unforeseen(request: Request, error: Exception) -> Response:
-    # Its message may hold paths or contents: the log has it, under this request's id.
+    # Its message may hold paths or contents: the log has it, with its traceback behind this line.
+    logger.error("request %s: %s %r failed", request_id(request), request.method, request.url.path[:200])
     return problem_response(request, InternalError("the server met an error of its own"), 500)
 
 

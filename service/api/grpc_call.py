@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -24,6 +25,7 @@ from straightpcf.service.telemetry import Telemetry
 __all__ = ["Caller", "Context", "answering"]
 
 DOMAIN = "straightpcf"
+_MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
 
 Context: TypeAlias = grpc.aio.ServicerContext[Any, Any]
 
@@ -57,6 +59,9 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
     except StraightPCFError as error:
         status = GRPC_STATUS_BY_CODE[error.code]
         await _abort(context, error, id)
+    except grpc.aio.InternalError as ended:  # by the caller, or by its deadline, in the midst of a write
+        status = "CANCELLED"
+        raise asyncio.CancelledError from ended
     except Exception as fault:
         passing = busy(fault) if isinstance(fault, OSError) else None
         if passing is None:
@@ -78,7 +83,8 @@ async def _abort(context: Context, error: StraightPCFError, request_id: str) -> 
     if error.retryable:
         delay = Duration(seconds=error.retry_after or RETRY_AFTER_SECONDS)
         details.append(error_details_pb2.RetryInfo(retry_delay=delay))
-    rich = status_pb2.Status(code=code_pb2.Code.Value(code), message=error.message)
+    message = error.message.encode()[:_MESSAGE_BYTES].decode(errors="ignore")
+    rich = status_pb2.Status(code=code_pb2.Code.Value(code), message=message)
     for detail in details:
         (packed := AnyMessage()).Pack(detail)
         rich.details.append(packed)

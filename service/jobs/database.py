@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.service.jobs.full_disk import is_full, release_reserve
 
-__all__ = ["check_database", "open_database"]
+__all__ = ["check_database", "open_database", "transaction"]
 
 SCHEMA_VERSION = 1
 _BUSY_SECONDS = 30.0
+# Every upload asks again and again for what is kept, beside the rows of all that has expired. Of a column that may have
+# to come first.
+_KEPT = "CREATE INDEX IF NOT EXISTS jobs_kept ON jobs (owner, spool) WHERE state <> 'expired'"
 
 
 def check_database(path: Path) -> None:
@@ -64,11 +68,30 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
     if version > SCHEMA_VERSION:
         raise InvalidOptions(f"{path} is of schema {version}; this straightpcf is older and knows {SCHEMA_VERSION}")
     db.executescript(files(__package__).joinpath("schema.sql").read_text())
+    if version != SCHEMA_VERSION:  # a full disk has no room for what is there already
+        with transaction(db):  # of several servers that start at once, one
+            _upgrade(db)
+    db.execute(_KEPT)
+
+
+def _upgrade(db: sqlite3.Connection) -> None:
     columns = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
     if "deaths" not in columns:  # before versions were counted
         db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
     if "spool" not in columns:  # likewise
         db.execute("ALTER TABLE jobs ADD COLUMN spool INTEGER NOT NULL DEFAULT 0")
         db.execute("UPDATE jobs SET spool = bytes + IFNULL(json_extract(result, '$.bytes'), 0)")
-    if version != SCHEMA_VERSION:  # a full disk has no room for what is there already
-        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+@contextmanager
+def transaction(db: sqlite3.Connection) -> Iterator[None]:
+    """Make what the block does one transaction, from its beginning on the only one that writes."""
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        db.execute("COMMIT")
+    except BaseException:
+        if db.in_transaction:  # a full disk may have ended it
+            db.execute("ROLLBACK")
+        raise

@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,7 +27,7 @@ from straightpcf.points.errors import (
     StraightPCFError,
 )
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.jobs.database import open_database
+from straightpcf.service.jobs.database import open_database, transaction
 from straightpcf.service.jobs.record import (
     FINISHED,
     STATES,
@@ -44,6 +45,7 @@ __all__ = ["JobStore"]
 
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+_DETAIL = 1000  # characters of what a job failed of that are kept: what a file says may be in it
 _PASSING: tuple[EventKind, ...] = ("preview", "progress")
 Hold = Literal["held", "canceled", "lost"]
 _FENCES = 2**32  # of one row: those of rows are apart, so that no fence comes back with an id that is used again
@@ -122,7 +124,9 @@ class JobStore:
         query = f"SELECT * FROM jobs WHERE {' AND '.join(where)} ORDER BY seq DESC LIMIT ?"
         rows = self._db.execute(query, [*values, limit + 1]).fetchall()
         more = len(rows) > limit
-        return [self._record(row) for row in rows[:limit]], str(rows[limit - 1]["seq"]) if more else None
+        queue = self._queue(max((row["seq"] for row in rows), default=0))
+        records = [self._record(row, queue) for row in rows[:limit]]
+        return records, str(rows[limit - 1]["seq"]) if more else None
 
     def events(self, id: str, after: int = 0) -> list[JobEvent]:
         """Return what happened behind event `after`."""
@@ -224,7 +228,7 @@ class JobStore:
             if not self._update(id, fence, "progress = progress"):
                 return False
             state: JobState = "canceled" if error.code == "job_canceled" else "failed"
-            self._end(id, state, error={"code": error.code, "detail": error.message}, expires_in=expires_in)
+            self._end(id, state, error={"code": error.code, "detail": error.message[:_DETAIL]}, expires_in=expires_in)
             return True
 
     def release(self, id: str, fence: int, message: str, *, expires_in: float, died: bool = False) -> bool:
@@ -292,16 +296,8 @@ class JobStore:
 
     # --- inside a transaction
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        self._db.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self._db.execute("COMMIT")
-        except BaseException:
-            if self._db.in_transaction:  # a full disk may have ended it
-                self._db.execute("ROLLBACK")
-            raise
+    def _transaction(self) -> AbstractContextManager[None]:
+        return transaction(self._db)
 
     def _known(self, job: NewJob) -> sqlite3.Row | None:
         if job.idempotency_key is not None:
@@ -352,9 +348,17 @@ class JobStore:
             (kind, json.dumps(data, allow_nan=False), time.time(), id),
         )
 
-    def _record(self, row: sqlite3.Row) -> JobRecord:
+    def _queue(self, last: int) -> list[int]:
+        """Return what waits up to row `last`, in order."""
+        query = "SELECT seq FROM jobs WHERE state = 'queued' AND seq <= ? ORDER BY seq"
+        return [row["seq"] for row in self._db.execute(query, (last,))]
+
+    def _record(self, row: sqlite3.Row, queue: list[int] | None = None) -> JobRecord:
+        """Read a row; queue: of many rows, so that each does not count anew how many are before it."""
         position = None
-        if row["state"] == "queued":
+        if row["state"] == "queued" and queue is not None:
+            position = bisect_left(queue, row["seq"])
+        elif row["state"] == "queued":
             query = "SELECT COUNT(*) FROM jobs WHERE state = 'queued' AND seq < ?"
             (position,) = self._db.execute(query, (row["seq"],)).fetchone()
         result = None if row["result"] is None else json.loads(row["result"])

@@ -101,3 +101,10 @@ def test_it_is_on_the_disk_before_it_takes_a_place(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(os, "fsync", fsync)
     write(path, b"new")
     assert synced == [(False, b"old"), (True, b"new")]
+
+
+def test_a_folder_that_takes_no_file_is_named_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"'/proc/self'$"):  # nobody may write there, root included
+        check_target(Path("/proc/self/a.ply"))
+    check_target(tmp_path / "a.ply")
+    assert not any(tmp_path.iterdir())

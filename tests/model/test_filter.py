@@ -136,6 +136,19 @@ def test_strength_scales_the_displacement(tiny: Filter) -> None:
     assert none.tobytes() == cloud.tobytes()
 
 
+def test_the_noise_left_is_that_of_what_comes_out() -> None:
+    model, cloud = load_filter(threads=2), noisy(torus(3000), 0.02)
+    none, some, most, full = (
+        model.denoise(cloud, DenoiseOptions(iterations=2, strength=strength)) for strength in (0.0, 0.5, 0.99, 1.0)
+    )
+    assert none.noise_after == none.noise_before == full.noise_before
+    assert full.noise_after < 0.5 * full.noise_before
+    assert 1.2 * full.noise_after < some.noise_after < 0.8 * full.noise_before
+    assert most.noise_after == pytest.approx(full.noise_after, rel=0.2)
+    again = model.denoise(some.xyz, DenoiseOptions(iterations=1))
+    assert again.noise_before == pytest.approx(some.noise_after, rel=0.2)
+
+
 def test_numbers_of_any_type_are_taken(tiny: Filter) -> None:
     single = noisy(torus(300), 0.01).astype(np.float32)
     expected = tiny.denoise(single.astype(np.float64), ONE_PASS).xyz

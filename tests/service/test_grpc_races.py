@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 
 grpc = pytest.importorskip("grpc")
 
+from straightpcf.points.errors import MalformedFile  # noqa: E402
 from straightpcf.points.wire import straightpcf_pb2 as pb  # noqa: E402
 from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub  # noqa: E402
+from straightpcf.service.backends.base import FileJob, FileReport, Listener  # noqa: E402
 from straightpcf.service.engine import Engine  # noqa: E402
 from tests.service.engines import until  # noqa: E402
 from tests.service.fakes import ObedientBackend  # noqa: E402
@@ -100,5 +105,69 @@ def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path:
             assert caught.value.code().name == "UNAVAILABLE"
             assert "shutting down" in caught.value.details()
             assert not any((tmp_path / "incoming").iterdir())
+
+    play(scenario)
+
+
+class Large(ObedientBackend):
+    """Give results that fill what a connection takes before they are read."""
+
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
+        report = await super().run(job, listener)
+        job.target.write_bytes(content := bytes(30 << 20))
+        return replace(report, bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
+
+
+def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend = Large()
+    backend.go.set()
+    backend.finish.set()
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, backend, grpc_port=(port := free_port())) as (engine, host, http_port),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            stub = DenoiseServiceStub(channel)
+            job = await stub.CreateJob(create_parts())
+            await engine.wait(job.id)
+            for _ in range(4):
+                call: Any = stub.DownloadResult(pb.DownloadResultRequest(id=job.id), timeout=0.3)
+                await call.read()
+                await asyncio.sleep(0.5)
+                assert await call.code() == grpc.StatusCode.DEADLINE_EXCEEDED
+            metrics = await asyncio.to_thread(httpx2.get, f"http://{host}:{http_port}/metrics")
+            told = [line for line in metrics.text.splitlines() if 'requests_total{method="DownloadResult"' in line]
+            assert told == ['straightpcf_grpc_requests_total{method="DownloadResult",status="CANCELLED"} 4.0']
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("letter", ["q", "点"])
+def test_an_error_of_any_length_arrives_as_what_it_is(tmp_path: Path, letter: str) -> None:
+    text = letter * 20_000
+    backend = ObedientBackend(MalformedFile(text))
+    backend.go.set()
+    backend.finish.set()
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, backend, grpc_port=(port := free_port())) as (engine, host, _),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            stub = DenoiseServiceStub(channel)
+            with pytest.raises(grpc.RpcError) as caught:
+                _ = [answer async for answer in stub.Denoise(denoise_parts())]
+            assert caught.value.code().name == "INVALID_ARGUMENT"
+            assert text.startswith(caught.value.details())
+            assert len(caught.value.details()) >= 500
+            backend.outcomes.append(MalformedFile(text))
+            job = await stub.CreateJob(create_parts())
+            record = await engine.wait(job.id)
+            assert record.error is not None
+            assert record.error.message == text[:1000]
 
     play(scenario)

@@ -137,3 +137,21 @@ async def _answer(reader: asyncio.StreamReader) -> bytes:
     head = await reader.readuntil(b"\r\n\r\n")
     size = head.lower().split(b"content-length: ")[1].split(b"\r\n")[0]
     return await reader.readexactly(int(size))
+
+
+def test_what_nobody_foresaw_is_logged_under_the_id_that_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (engine, host, port), httpx2.AsyncClient() as http:
+
+            async def broken(id: str, *, owner: str = "") -> None:
+                raise RuntimeError("secret")
+
+            engine.get = broken  # type: ignore[assignment, method-assign]
+            answer = await http.get(f"http://{host}:{port}/jobs/a", headers={"X-Request-Id": "findme-123"})
+            assert (answer.status_code, answer.json()["request_id"]) == (500, "findme-123")
+            assert "secret" not in answer.text
+
+    play(scenario)
+    assert "request findme-123: GET '/jobs/a' failed" in caplog.text

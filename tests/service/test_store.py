@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from straightpcf.points.errors import InternalError
@@ -106,3 +108,51 @@ def test_other_users_of_the_machine_cannot_look_into_what_is_kept(tmp_path: Path
                 assert path.stat().st_mode & 0o077 == 0, path
     finally:
         os.umask(before)
+
+
+OLD = """
+CREATE TABLE jobs (seq INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, owner TEXT NOT NULL,
+  folder TEXT NOT NULL UNIQUE, state TEXT NOT NULL, name TEXT, format TEXT, options TEXT NOT NULL,
+  bytes INTEGER NOT NULL, weight INTEGER NOT NULL, points INTEGER, progress REAL NOT NULL DEFAULT 0,
+  attempts INTEGER NOT NULL DEFAULT 0, fence INTEGER NOT NULL DEFAULT 0, server TEXT, lease_until REAL,
+  cancel_requested INTEGER NOT NULL DEFAULT 0, created_at REAL NOT NULL, started_at REAL, finished_at REAL,
+  expires_at REAL, error TEXT, result TEXT, report TEXT, traceparent TEXT, idempotency_key TEXT, digest TEXT NOT NULL);
+INSERT INTO jobs (id, owner, folder, state, options, bytes, weight, created_at, result, digest)
+  VALUES ('old', '', 'old', 'succeeded', '{}', 7, 1, 0, '{"bytes": 5}', 'old');
+"""
+
+
+def test_servers_that_start_at_once_on_an_old_file_all_do(tmp_path: Path) -> None:
+    for attempt in range(20):
+        path = tmp_path / f"{attempt}.sqlite3"
+        with closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.executescript(OLD)
+        with ThreadPoolExecutor(3) as pool:
+            for store in pool.map(JobStore, [path] * 3):
+                assert store.load().bytes == 12
+                store.close()
+
+
+def test_what_every_upload_asks_for_is_answered_by_an_index(tmp_path: Path) -> None:
+    path = tmp_path / "jobs.sqlite3"
+    asked: list[str] = []
+    with closing(JobStore(path)) as store:
+        store.create(new_job("one", folder="one"))
+        store._db.set_trace_callback(asked.append)
+        for owner in (None, ""):
+            assert store.load(owner).bytes == 2
+    with closing(sqlite3.connect(path)) as db:
+        plans = [row[3] for query in asked for row in db.execute(f"EXPLAIN QUERY PLAN {query}")]
+    assert len(plans) >= 4
+    assert all("INDEX" in plan for plan in plans), plans
+
+
+def test_a_page_of_jobs_says_where_each_stands_in_the_queue(tmp_path: Path) -> None:
+    with closing(JobStore(tmp_path / "jobs.sqlite3")) as store:
+        for number in range(7):
+            store.create(replace(new_job(f"j{number}", folder=str(number)), owner="other" if number % 3 == 1 else ""))
+        store.claim("here", 15.0)
+        page, _ = store.page(owner="", limit=10)
+        assert [(job.id, job.position) for job in page] == [(job.id, store.get(job.id).position) for job in page]
+        assert [job.position for job in page] == [5, 4, 2, 1, None]
