@@ -32,6 +32,7 @@ __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
 
 Stage = Literal["vm", "cvm", "dm"]
 STATE_FILE = "state.safetensors"
+_LOG_FILE, _COLUMNS = "log.csv", ("stage", "iteration", "loss", "validation", "learning_rate", "seconds")
 _LOSSES = {"vm": velocity_loss, "cvm": coupled_loss, "dm": distance_loss}
 _WARMUP = 200
 _TURN_EVERY = 10  # iterations between two turns of the optimiser's bases
@@ -132,10 +133,9 @@ def train(
     fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
     validation: float | None = None
-    with (run_dir / "log.csv").open("a", newline="") as file, team or nullcontext():
+    _cut_log(run_dir / _LOG_FILE, start)
+    with (run_dir / _LOG_FILE).open("a", newline="") as file, team or nullcontext():
         log = csv.writer(file)
-        if start == 0:
-            log.writerow(["stage", "iteration", "loss", "validation", "learning_rate", "seconds"])
         recent: list[float] = []
         recent_loss = math.nan
         trained.train(not settled)
@@ -168,6 +168,16 @@ def train(
             if last:
                 break
     return state_path
+
+
+def _cut_log(path: Path, start: int) -> None:
+    """Keep of a log what the state has that a run goes on from: what an interruption lost will come again."""
+    rows: list[list[str]] = []
+    if start and path.exists():
+        with path.open(newline="") as file:
+            rows = [row for row in csv.reader(file) if len(row) == len(_COLUMNS) and row[1].isdigit()]
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([_COLUMNS, *(row for row in rows if int(row[1]) <= start)])
 
 
 def _network(stage: Stage, init: Path | None, couplings: int, *, resuming: bool) -> StraightPCF:

@@ -68,14 +68,19 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
     if version > SCHEMA_VERSION:
         raise InvalidOptions(f"{path} is of schema {version}; this straightpcf is older and knows {SCHEMA_VERSION}")
     db.executescript(files(__package__).joinpath("schema.sql").read_text())
-    if version != SCHEMA_VERSION:  # a full disk has no room for what is there already
+    # Asked before: a full disk has no room for what is there already.
+    if version != SCHEMA_VERSION or not {"deaths", "spool"} <= _columns(db):
         with transaction(db):  # of several servers that start at once, one
             _upgrade(db)
     db.execute(_KEPT)
 
 
+def _columns(db: sqlite3.Connection) -> set[str]:
+    return {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
+
+
 def _upgrade(db: sqlite3.Connection) -> None:
-    columns = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
+    columns = _columns(db)
     if "deaths" not in columns:  # before versions were counted
         db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
     if "spool" not in columns:  # likewise

@@ -128,6 +128,21 @@ def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> Non
     assert (tmp_path / "log.csv").read_text().count("stage") == 1
 
 
+def test_what_an_interruption_lost_stands_in_the_log_once(data: Path, tmp_path: Path) -> None:
+    def iterations() -> list[str]:
+        return [row.split(",")[1] for row in (tmp_path / "log.csv").read_text().splitlines()]
+
+    (tmp_path / "log.csv").write_text(
+        "stage,iteration\nvm,50,1,,1,1\n"
+    )  # of a run that was ended before its first state
+    train("vm", data=data, run_dir=tmp_path, iterations=2, batch_size=2, threads=1)
+    assert iterations() == ["iteration", "2"]
+    with (tmp_path / "log.csv").open("a") as log:
+        log.write("vm,50,1.0,,0.001,1.0\r\nvm,10")  # and then within a line
+    train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1)
+    assert iterations() == ["iteration", "2", "3"]
+
+
 def test_an_interrupted_run_ends_with_the_weights_of_an_uninterrupted_one(data: Path, tmp_path: Path) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
     train("vm", data=data, run_dir=once, iterations=12, batch_size=1, threads=1)

@@ -320,7 +320,7 @@ def test_a_store_from_before_patches_were_counted_is_taken_over(tmp_path: Path) 
 
     play(tmp_path, leave)
     with closing(sqlite3.connect(tmp_path / "jobs.sqlite3")) as db:
-        db.execute("ALTER TABLE jobs DROP COLUMN spool")
+        db.executescript("DROP INDEX jobs_kept; ALTER TABLE jobs DROP COLUMN spool")
     play(tmp_path, find)
 
 
