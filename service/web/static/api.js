@@ -51,7 +51,7 @@ export function upload(path, file, { onProgress, signal }) {
       if (request.status < 300) resolve(JSON.parse(request.responseText));
       else reject(problemFrom(request.status, request.responseText, request.getResponseHeader("X-Request-Id")));
     });
-    request.addEventListener("error", () => reject(unreachable()));
+    request.addEventListener("error", async () => reject(await unsent(file)));
     request.addEventListener("abort", () => reject(new DOMException("canceled", "AbortError")));
     signal.addEventListener("abort", () => request.abort());
     request.send(file);
@@ -77,6 +77,16 @@ function authorization() {
 
 function unreachable() {
   return new Problem({ detail: "The server does not answer. Is it running, and is the network there?", retryable: true });
+}
+
+// Why a file did not arrive: the browser does not tell one that it could not read from a server that is away.
+async function unsent(file) {
+  try {
+    await file.slice(0, 1).arrayBuffer();
+    return unreachable();
+  } catch {
+    return new Problem({ code: "", detail: `${file.name} has changed or is gone since it was chosen; choose it again.` });
+  }
 }
 
 function problemFrom(status, text, requestId) {
