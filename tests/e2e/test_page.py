@@ -149,6 +149,18 @@ def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, s
     assert float(page.inner_text("#legend-top").split()[0].replace(",", "")) < 0.5
 
 
+def test_a_result_is_shown_though_its_patches_never_come(page: Any, scan: Path) -> None:
+    page.evaluate("() => { const on = setTimeout; window.setTimeout = (act, ms) => on(act, ms === 10000 ? 300 : ms); }")
+    held: list[Any] = []
+    page.route("**/stream", lambda route: held.append(route))
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert held
+    assert page.is_visible("#legend"), "the viewer has only the noisy cloud"
+
+
 def test_deleting_what_is_shown_takes_it_away_and_keeps_the_focus(page: Any, scan: Path) -> None:
     page.set_input_files("#file", scan)
     page.select_option("#iterations", "1")
