@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 
@@ -136,6 +137,30 @@ def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     assert "canceled" in page.inner_text("#note")
 
 
+@pytest.mark.parametrize("how", ["canceled", "cut off"])
+def test_no_job_is_left_of_what_was_sent_without_an_answer(
+    page: Any, scan: Path, server: RunningServer, how: str
+) -> None:
+    held: list[Any] = []
+    deleted: list[int] = []
+    page.route("**/jobs/*?*", lambda route: held.append(route))
+    page.on("response", lambda answer: deleted.append(answer.status) if answer.request.method == "DELETE" else None)
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    wait_for(lambda: page.wait_for_timeout(50) or held)
+    if how == "canceled":
+        page.click("#cancel")
+    else:
+        held[0].abort()
+    page.wait_for_selector("#cancel", state="hidden")
+    wait_for(lambda: page.wait_for_timeout(50) or deleted)
+    # The server was still reading it.
+    assert httpx2.put(held[0].request.url, content=scan.read_bytes()).status_code == 202
+    wait_for(lambda: page.wait_for_timeout(50) or deleted[-1] == 204)
+    assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
+    assert ("does not answer" in page.inner_text("#error")) == (how == "cut off")
+
+
 def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, scan: Path, tmp_path: Path) -> None:
     np.save(other := tmp_path / "other.npy", 3 + noisy(sphere(POINTS), 0.01))  # as many points, elsewhere
     page.select_option("#iterations", "1")
@@ -196,7 +221,7 @@ def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, t
     page.click("#submit")
     page.wait_for_selector("#report:not([hidden])")
     held: list[Any] = []
-    page.route("**/jobs?*filename=large*", lambda route: held.append(route))
+    page.route("**/jobs/*?*filename=large*", lambda route: held.append(route))
     page.set_input_files("#file", large)
     page.click("#submit")
     wait_for(lambda: bool(page.wait_for_timeout(50) or held))

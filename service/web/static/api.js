@@ -22,13 +22,13 @@ export function url(path) {
   return new URL(path, document.baseURI).href;
 }
 
-export async function call(path, { method = "GET", headers = {}, signal } = {}) {
+export async function call(path, { method = "GET", headers = {}, ...more } = {}) {
   const sent = { ...authorization(), ...headers };
   let response;
   try {
-    response = await fetch(url(path), { method, headers: sent, signal, cache: "no-store" });
+    response = await fetch(url(path), { method, headers: sent, cache: "no-store", ...more });
   } catch (error) {
-    if (signal?.aborted) throw error;
+    if (more.signal?.aborted) throw error;
     throw unreachable();
   }
   if (!response.ok) throw problemFrom(response.status, await response.text(), response.headers.get("X-Request-Id"));
@@ -39,11 +39,11 @@ export async function json(path, options) {
   return (await call(path, options)).json();
 }
 
-// POST a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
+// PUT a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
 export function upload(path, file, { onProgress, signal }) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
-    request.open("POST", url(path));
+    request.open("PUT", url(path));
     for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
     request.setRequestHeader("Content-Type", "application/octet-stream");
     request.upload.addEventListener("progress", (event) => onProgress(event.loaded / Math.max(event.total, 1)));
