@@ -255,6 +255,27 @@ def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
         assert page.evaluate(said, list(MALFORMED[case][0])) == "names that do not say x, y, z", case
 
 
+def test_lengths_are_written_as_people_read_them(page: Any) -> None:
+    values = [0, 2.5e-16, 0.00012345, 0.5, 9.996, 12.345, 999.7, 1234.4, -98765.4, 5.4e6, None]
+    said = ["0", "2.50e-16", "0.000123", "0.5", "10", "12.3", "1,000", "1,234", "-98,765", "5.40e+6", "unknown"]
+    asked = (
+        "async (values) => { const { length } = await import('/static/text.js'); return values.map((v) => length(v)) }"
+    )
+    assert page.evaluate(asked, values) == said
+
+
+def test_the_ends_of_a_legend_differ_where_they_do(page: Any) -> None:
+    asked = "async (two) => (await import('/static/text.js')).ends(...two)"
+    for two, said in (
+        ([0, 0.01234], ["0", "0.0123"]),
+        ([100.01, 100.0234], ["100.01", "100.02"]),
+        ([1234.56, 1234.58], ["1,234.56", "1,234.58"]),
+        ([5400000.25, 5400000.75], ["5.400000e+6", "5.400001e+6"]),
+        ([7, 7], ["7", "7"]),
+    ):
+        assert page.evaluate(asked, two) == said
+
+
 def _is_fault(said: Any) -> bool:
     if said.type != "error" or "/static/" in said.location.get("url", ""):
         return bool(said.type == "error")
