@@ -276,6 +276,30 @@ def test_the_ends_of_a_legend_differ_where_they_do(page: Any) -> None:
         assert page.evaluate(asked, two) == said
 
 
+def test_where_nothing_moved_the_legend_says_so(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.fill("#strength", "0")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert (page.inner_text("#legend-low"), page.inner_text("#legend-top")) == ("0", "0")
+
+
+def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
+    """The page cannot read NPZ, and so colours the result by height."""
+    flat = np.c_[np.random.default_rng(0).uniform(0, 50, (POINTS, 2)), np.full(POINTS, 1000.0)]
+    np.savez(tmp_path / "flat.npz", points=flat)
+    page.set_input_files("#file", tmp_path / "flat.npz")
+    page.select_option("#iterations", "1")
+    page.fill("#strength", "0")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert (page.inner_text("#legend-low"), page.inner_text("#legend-top")) == ("1,000", "1,000")
+    page.wait_for_timeout(500)  # a frame or two of the viewer
+    lowest = (0x44 / 255, 0x01 / 255, 0x54 / 255)  # which fades with depth
+    assert (np.abs(_picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
+
+
 def _is_fault(said: Any) -> bool:
     if said.type != "error" or "/static/" in said.location.get("url", ""):
         return bool(said.type == "error")

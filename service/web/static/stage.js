@@ -87,7 +87,7 @@ export class Stage {
     parts["legend-title"].textContent = cloud.hasBefore ? "moved, in the file’s unit" : "height z, in the file’s unit";
     const [low, top] = text.ends(range.low, range.top);
     parts["legend-low"].textContent = low;
-    parts["legend-top"].textContent = cloud.hasBefore ? `${top} and more` : top;
+    parts["legend-top"].textContent = cloud.hasBefore && range.top > range.low ? `${top} and more` : top;
   }
 
   blend(value) {
