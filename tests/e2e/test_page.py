@@ -242,6 +242,30 @@ def test_a_key_is_kept_through_a_reload(page: Any) -> None:
     assert page.is_visible("#key")
 
 
+def test_enter_in_the_field_of_the_key_takes_it_and_sends_nothing(page: Any) -> None:
+    page.evaluate("sessionStorage.setItem('straightpcf.key', 'secret')")
+    page.reload()
+    page.wait_for_selector("#server:has-text('version')")
+    page.fill("#key", "other")
+    with page.expect_response("**/v1/info"):
+        page.press("#key", "Enter")
+    assert page.evaluate("sessionStorage.getItem('straightpcf.key')") == "other"
+    assert page.is_hidden("#error")
+
+
+def test_an_answer_of_a_proxy_that_wants_a_login_is_explained(page: Any, scan: Path) -> None:
+    for path in ("**/jobs/*?*", "**/jobs?*"):
+        page.route(path, lambda route: route.fulfill(body="<html>Log in</html>", content_type="text/html"))
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "log in" in page.inner_text("#error")
+    assert page.is_hidden("#cancel")
+    page.evaluate("sessionStorage.setItem('straightpcf.jobs', '[\"a\"]')")
+    page.reload()
+    page.wait_for_selector("#error:has-text('log in')")
+
+
 def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
     read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
     for case, raw in TABLES.items():

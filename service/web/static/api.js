@@ -36,7 +36,8 @@ export async function call(path, { method = "GET", headers = {}, ...more } = {})
 }
 
 export async function json(path, options) {
-  return (await call(path, options)).json();
+  const response = await call(path, options);
+  return parsed(response.status, await response.text(), response.headers.get("X-Request-Id"));
 }
 
 // PUT a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
@@ -48,8 +49,13 @@ export function upload(path, file, { onProgress, signal }) {
     request.setRequestHeader("Content-Type", "application/octet-stream");
     request.upload.addEventListener("progress", (event) => onProgress(event.loaded / Math.max(event.total, 1)));
     request.addEventListener("load", () => {
-      if (request.status < 300) resolve(JSON.parse(request.responseText));
-      else reject(problemFrom(request.status, request.responseText, request.getResponseHeader("X-Request-Id")));
+      const answer = [request.status, request.responseText, request.getResponseHeader("X-Request-Id")];
+      try {
+        if (request.status >= 300) throw problemFrom(...answer);
+        resolve(parsed(...answer));
+      } catch (problem) {
+        reject(problem); // what is thrown in a listener is lost
+      }
     });
     request.addEventListener("error", async () => reject(await unsent(file)));
     request.addEventListener("abort", () => reject(new DOMException("canceled", "AbortError")));
@@ -86,6 +92,15 @@ async function unsent(file) {
     return unreachable();
   } catch {
     return new Problem({ code: "", detail: `${file.name} has changed or is gone since it was chosen; choose it again.` });
+  }
+}
+
+function parsed(status, text, requestId) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    const detail = "The answer is not this server's: a proxy before it may want you to log in. Reload the page.";
+    throw new Problem({ status, code: "error", detail, requestId: requestId ?? "" });
   }
 }
 

@@ -26,15 +26,22 @@ parts.form.addEventListener("submit", (event) => {
   send().catch(showProblem);
 });
 parts.cancel.addEventListener("click", () => cancel().catch(showProblem));
-parts.key.addEventListener("change", () => {
-  parts.error.hidden = true; // it was of the key before
-  keepApiKey(parts.key.value.trim());
-  begin();
+parts.key.addEventListener("change", takeKey);
+parts.key.addEventListener("keydown", (event) => {
+  if (event.key !== "Enter") return;
+  event.preventDefault(); // it would send the form
+  takeKey();
 });
 parts["jobs-refresh"].addEventListener("click", listJobs);
 parts.key.value = apiKey(); // a reload keeps it
 parts["key-row"].hidden = !apiKey();
 begin();
+
+function takeKey() {
+  parts.error.hidden = true; // it was of the key before
+  keepApiKey(parts.key.value.trim());
+  begin();
+}
 
 function begin() {
   json("v1/info").then((info) => form.showInfo(info)).catch(showProblem);
