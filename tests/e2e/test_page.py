@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 
-from straightpcf.points.formats import read_cloud
+from straightpcf.points.formats import format_named, read_cloud
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
-from tests.points.test_xyz import MALFORMED, TABLES
+from tests.points.test_xyz import MALFORMED, TABBED, TABLES
 from tests.waiting import wait_for
 
 POINTS = 2500
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+POSITIONS = "async ([b, name]) => [...(await import('/static/read/index.js')).readPositions(new Uint8Array(b), name)]"
+_UNANSWERED = "Failed to load resource: net::ERR_"
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync",
     "--disable-component-update", "--use-gl=swiftshader", "--enable-unsafe-swiftshader",
@@ -98,6 +102,22 @@ def test_a_broken_file_is_explained_and_the_page_goes_on(page: Any, scan: Path, 
     assert page.is_hidden("#error")
 
 
+def test_a_file_that_has_changed_is_named_and_can_be_chosen_again(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.wait_for_selector("#empty", state="hidden")
+    os.utime(scan, (0, 0))
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#error:not([hidden])")
+    assert page.inner_text("#error") == "scan.ply has changed or is gone since it was chosen; choose it again."
+    with page.expect_file_chooser() as chooser:
+        page.click("#file")
+    assert page.input_value("#file") == "", "the same file again would be no change"
+    chooser.value.set_files(scan)
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+
+
 def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     page: Any, scan: Path, tmp_path: Path
 ) -> None:
@@ -118,6 +138,30 @@ def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     assert "canceled" in page.inner_text("#note")
 
 
+@pytest.mark.parametrize("how", ["canceled", "cut off"])
+def test_no_job_is_left_of_what_was_sent_without_an_answer(
+    page: Any, scan: Path, server: RunningServer, how: str
+) -> None:
+    held: list[Any] = []
+    deleted: list[int] = []
+    page.route("**/jobs/*?*", lambda route: held.append(route))
+    page.on("response", lambda answer: deleted.append(answer.status) if answer.request.method == "DELETE" else None)
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    wait_for(lambda: page.wait_for_timeout(50) or held)
+    if how == "canceled":
+        page.click("#cancel")
+    else:
+        held[0].abort()
+    page.wait_for_selector("#cancel", state="hidden")
+    wait_for(lambda: page.wait_for_timeout(50) or deleted)
+    # The server was still reading it.
+    assert httpx2.put(held[0].request.url, content=scan.read_bytes()).status_code == 202
+    wait_for(lambda: page.wait_for_timeout(50) or deleted[-1] == 204)
+    assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
+    assert ("does not answer" in page.inner_text("#error")) == (how == "cut off")
+
+
 def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, scan: Path, tmp_path: Path) -> None:
     np.save(other := tmp_path / "other.npy", 3 + noisy(sphere(POINTS), 0.01))  # as many points, elsewhere
     page.select_option("#iterations", "1")
@@ -129,6 +173,18 @@ def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, s
     page.wait_for_selector("#report", state="hidden")
     page.wait_for_selector("#report:not([hidden])")
     assert float(page.inner_text("#legend-top").split()[0].replace(",", "")) < 0.5
+
+
+def test_a_result_is_shown_though_its_patches_never_come(page: Any, scan: Path) -> None:
+    page.evaluate("() => { const on = setTimeout; window.setTimeout = (act, ms) => on(act, ms === 10000 ? 300 : ms); }")
+    held: list[Any] = []
+    page.route("**/stream", lambda route: held.append(route))
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert held
+    assert page.is_visible("#legend"), "the viewer has only the noisy cloud"
 
 
 def test_deleting_what_is_shown_takes_it_away_and_keeps_the_focus(page: Any, scan: Path) -> None:
@@ -166,7 +222,7 @@ def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, t
     page.click("#submit")
     page.wait_for_selector("#report:not([hidden])")
     held: list[Any] = []
-    page.route("**/jobs?*filename=large*", lambda route: held.append(route))
+    page.route("**/jobs/*?*filename=large*", lambda route: held.append(route))
     page.set_input_files("#file", large)
     page.click("#submit")
     wait_for(lambda: bool(page.wait_for_timeout(50) or held))
@@ -186,10 +242,76 @@ def test_a_key_is_kept_through_a_reload(page: Any) -> None:
     assert page.is_visible("#key")
 
 
+def test_enter_in_the_field_of_the_key_takes_it_and_sends_nothing(page: Any) -> None:
+    page.evaluate("sessionStorage.setItem('straightpcf.key', 'secret')")
+    page.reload()
+    page.wait_for_selector("#server:has-text('version')")
+    page.fill("#key", "other")
+    with page.expect_response("**/v1/info"):
+        page.press("#key", "Enter")
+    assert page.evaluate("sessionStorage.getItem('straightpcf.key')") == "other"
+    assert page.is_hidden("#error")
+
+
+def test_an_answer_of_a_proxy_that_wants_a_login_is_explained(page: Any, scan: Path) -> None:
+    for path in ("**/jobs/*?*", "**/jobs?*"):
+        page.route(path, lambda route: route.fulfill(body="<html>Log in</html>", content_type="text/html"))
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.wait_for_selector("#error:not([hidden])")
+    assert "log in" in page.inner_text("#error")
+    assert page.is_hidden("#cancel")
+    page.evaluate("sessionStorage.setItem('straightpcf.jobs', '[\"a\"]')")
+    page.reload()
+    page.wait_for_selector("#error:has-text('log in')")
+
+
 def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
     read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
     for case, raw in TABLES.items():
         assert page.evaluate(read, list(raw)) == [1, 2, 3, 4, 5, 6], case
+
+
+def test_the_page_reads_every_suffix_of_text_tables(page: Any) -> None:
+    for suffix in (suffix for name in ("xyz", "csv", "tsv", "pts") for suffix in format_named(name).suffixes):
+        assert page.evaluate(POSITIONS, [list(b"1 2 3\n4 5 6\n"), f"A{suffix.upper()}"]) == [1, 2, 3, 4, 5, 6], suffix
+        assert page.evaluate("async (n) => (await import('/static/read/reader.js')).canRead(n, 9)", f"a{suffix}"), (
+            suffix
+        )
+
+
+def test_the_page_splits_a_tsv_at_its_tabs_as_the_server_does(page: Any) -> None:
+    for case, raw in (TABBED | TABLES).items():
+        assert page.evaluate(POSITIONS, [list(raw), "a.tsv"]) == [1, 2, 3, 4, 5, 6], case
+    gaps = page.evaluate(POSITIONS, [list(b"x\ty\tz\n1\t2\t3\n\t\t\n4\t\t6\n"), "a.tsv"])
+    np.testing.assert_array_equal(np.array(gaps, np.float64), [1, 2, 3, np.nan, np.nan, np.nan, 4, np.nan, 6])
+
+
+def test_the_page_reads_a_ply_with_capital_axes(page: Any, scan: Path, tmp_path: Path) -> None:
+    for axis in b"xyz":
+        scan.write_bytes(scan.read_bytes().replace(b"float %c\n" % axis, b"float %c\n" % (axis - 32)))
+    read = page.evaluate(POSITIONS, [list(scan.read_bytes()), "a.ply"])
+    np.testing.assert_array_equal(np.reshape(read, (-1, 3)), read_cloud(scan)[0].xyz)
+
+
+@pytest.mark.parametrize("separator", [" ", ",", "\t"])
+def test_the_page_refuses_a_first_column_that_counts_the_points_as_the_server_does(page: Any, separator: str) -> None:
+    said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031
+    name = "a.tsv" if separator == "\t" else "a.txt"
+
+    def answer(rows: list[str], above: str = "") -> Any:
+        raw = "\n".join([above, *rows]).replace(" ", separator).encode()
+        return page.evaluate(said, [list(raw), name])
+
+    counted = [f"{n} {n % 7}.5 2 3.25 tree" for n in range(1, 51)]
+    assert "counts the points" in answer(counted)
+    assert answer(counted, "id x y z code") == 150
+    assert answer([f"{n} 0 1" for n in range(50)]) == 150
+    assert answer([f"{n} 0 1 oak" for n in range(50)]) == 150
+    assert answer([f"{n % 10} {n // 10} 1 7" for n in range(50)]) == 150
+    assert answer([f"{n + 0.5} 0 1 7" for n in range(50)]) == 150
+    assert answer([f"{n} 0 1 7" for n in range(9)]) == 27
+    assert answer([f"{2 * n} 0 1 7" for n in range(50)]) == 150
 
 
 def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
@@ -200,8 +322,55 @@ def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
         assert page.evaluate(said, list(MALFORMED[case][0])) == "names that do not say x, y, z", case
 
 
+def test_lengths_are_written_as_people_read_them(page: Any) -> None:
+    values = [0, 2.5e-16, 0.00012345, 0.5, 9.996, 12.345, 999.7, 1234.4, -98765.4, 5.4e6, None]
+    said = ["0", "2.50e-16", "0.000123", "0.5", "10", "12.3", "1,000", "1,234", "-98,765", "5.40e+6", "unknown"]
+    asked = (
+        "async (values) => { const { length } = await import('/static/text.js'); return values.map((v) => length(v)) }"
+    )
+    assert page.evaluate(asked, values) == said
+
+
+def test_the_ends_of_a_legend_differ_where_they_do(page: Any) -> None:
+    asked = "async (two) => (await import('/static/text.js')).ends(...two)"
+    for two, said in (
+        ([0, 0.01234], ["0", "0.0123"]),
+        ([100.01, 100.0234], ["100.01", "100.02"]),
+        ([1234.56, 1234.58], ["1,234.56", "1,234.58"]),
+        ([5400000.25, 5400000.75], ["5.400000e+6", "5.400001e+6"]),
+        ([7, 7], ["7", "7"]),
+    ):
+        assert page.evaluate(asked, two) == said
+
+
+def test_where_nothing_moved_the_legend_says_so(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.fill("#strength", "0")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert (page.inner_text("#legend-low"), page.inner_text("#legend-top")) == ("0", "0")
+
+
+def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
+    """The page cannot read NPZ, and so colours the result by height."""
+    flat = np.c_[np.random.default_rng(0).uniform(0, 50, (POINTS, 2)), np.full(POINTS, 1000.0)]
+    np.savez(tmp_path / "flat.npz", points=flat)
+    page.set_input_files("#file", tmp_path / "flat.npz")
+    page.select_option("#iterations", "1")
+    page.fill("#strength", "0")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert (page.inner_text("#legend-low"), page.inner_text("#legend-top")) == ("1,000", "1,000")
+    page.wait_for_timeout(500)  # a frame or two of the viewer
+    lowest = (0x44 / 255, 0x01 / 255, 0x54 / 255)  # which fades with depth
+    assert (np.abs(_picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
+
+
 def _is_fault(said: Any) -> bool:
-    return bool(said.type == "error" and "status of 422" not in said.text)
+    if said.type != "error" or "/static/" in said.location.get("url", ""):
+        return bool(said.type == "error")
+    return not said.text.startswith(("Failed to load resource: the server responded with a status of 4", _UNANSWERED))
 
 
 def _picture(page: Any) -> np.ndarray:

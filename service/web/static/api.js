@@ -22,13 +22,13 @@ export function url(path) {
   return new URL(path, document.baseURI).href;
 }
 
-export async function call(path, { method = "GET", headers = {}, signal } = {}) {
+export async function call(path, { method = "GET", headers = {}, ...more } = {}) {
   const sent = { ...authorization(), ...headers };
   let response;
   try {
-    response = await fetch(url(path), { method, headers: sent, signal, cache: "no-store" });
+    response = await fetch(url(path), { method, headers: sent, cache: "no-store", ...more });
   } catch (error) {
-    if (signal?.aborted) throw error;
+    if (more.signal?.aborted) throw error;
     throw unreachable();
   }
   if (!response.ok) throw problemFrom(response.status, await response.text(), response.headers.get("X-Request-Id"));
@@ -36,22 +36,28 @@ export async function call(path, { method = "GET", headers = {}, signal } = {}) 
 }
 
 export async function json(path, options) {
-  return (await call(path, options)).json();
+  const response = await call(path, options);
+  return parsed(response.status, await response.text(), response.headers.get("X-Request-Id"));
 }
 
-// POST a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
+// PUT a file as the body. XMLHttpRequest, because fetch does not tell how far an upload is.
 export function upload(path, file, { onProgress, signal }) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
-    request.open("POST", url(path));
+    request.open("PUT", url(path));
     for (const [name, value] of Object.entries(authorization())) request.setRequestHeader(name, value);
     request.setRequestHeader("Content-Type", "application/octet-stream");
     request.upload.addEventListener("progress", (event) => onProgress(event.loaded / Math.max(event.total, 1)));
     request.addEventListener("load", () => {
-      if (request.status < 300) resolve(JSON.parse(request.responseText));
-      else reject(problemFrom(request.status, request.responseText, request.getResponseHeader("X-Request-Id")));
+      const answer = [request.status, request.responseText, request.getResponseHeader("X-Request-Id")];
+      try {
+        if (request.status >= 300) throw problemFrom(...answer);
+        resolve(parsed(...answer));
+      } catch (problem) {
+        reject(problem); // what is thrown in a listener is lost
+      }
     });
-    request.addEventListener("error", () => reject(unreachable()));
+    request.addEventListener("error", async () => reject(await unsent(file)));
     request.addEventListener("abort", () => reject(new DOMException("canceled", "AbortError")));
     signal.addEventListener("abort", () => request.abort());
     request.send(file);
@@ -77,6 +83,25 @@ function authorization() {
 
 function unreachable() {
   return new Problem({ detail: "The server does not answer. Is it running, and is the network there?", retryable: true });
+}
+
+// Why a file did not arrive: the browser does not tell one that it could not read from a server that is away.
+async function unsent(file) {
+  try {
+    await file.slice(0, 1).arrayBuffer();
+    return unreachable();
+  } catch {
+    return new Problem({ code: "", detail: `${file.name} has changed or is gone since it was chosen; choose it again.` });
+  }
+}
+
+function parsed(status, text, requestId) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    const detail = "The answer is not this server's: a proxy before it may want you to log in. Reload the page.";
+    throw new Problem({ status, code: "error", detail, requestId: requestId ?? "" });
+  }
 }
 
 function problemFrom(status, text, requestId) {

@@ -61,6 +61,7 @@ export class Cloud {
   }
 
   // The colours' ends: 0 to the 99th percentile of the moved distances; the 1st to the 99th of the heights.
+  // The two may be equal.
   range() {
     const step = Math.max(1, Math.floor(this.shown / SAMPLE));
     const values = [];
@@ -72,7 +73,7 @@ export class Cloud {
     const sorted = Float64Array.from(values).sort();
     const at = (share) => sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))];
     const low = this.hasBefore ? 0 : at(0.01);
-    return { low, top: Math.max(at(0.99), low + Number.EPSILON) };
+    return { low, top: at(0.99) };
   }
 
   // Call visit(x, y, z) for some thousand points that have a position.

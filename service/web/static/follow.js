@@ -1,6 +1,6 @@
 // Follow one job from its id to its end: events for the words, patches for the picture.
 
-import { call } from "./api.js";
+import { call, pause } from "./api.js";
 import { Cloud } from "./cloud.js";
 import { watchJob } from "./events.js";
 import { watchPatches } from "./patches.js";
@@ -8,6 +8,7 @@ import { canRead, readFile } from "./read/reader.js";
 
 const REFRESH_MS = 250;
 const REFRESH_MS_PER_MILLION = 750;
+const SILENCE_MS = 10_000; // of the patches of a job that is done: a proxy may keep them
 
 // before: {count, stride, xyz} of the reader, or null. hooks: onEvent(kind, data), onCloud(cloud, note), onPoints({isWhole}).
 // Resolve to the finished job.
@@ -29,18 +30,30 @@ export async function followJob(id, { before, hooks, signal }) {
     cloud = new Cloud({ count: points });
     hooks.onCloud(cloud, note || `Only the result is shown, coloured by height. ${thinning(cloud)}`);
   };
+  let frames = 0;
   const onFrame = (frame) => {
+    frames++;
     cloud.put(frame.rows, frame.xyz);
     soon();
   };
 
   const ended = new AbortController();
-  const patches = watchPatches(id, { onHeader, onFrame, isOver: () => isOver }, AbortSignal.any([signal, ended.signal])).catch(() => false);
+  const either = AbortSignal.any([signal, ended.signal]);
+  const patches = watchPatches(id, { onHeader, onFrame, isOver: () => isOver }, either).catch(() => false);
+  const silence = async () => {
+    for (let before = -1; before !== frames; ) {
+      before = frames;
+      await pause(SILENCE_MS, either);
+    }
+    return false;
+  };
   try {
     const job = await watchJob(id, hooks.onEvent, signal);
     isOver = true;
     if (job.state !== "succeeded") return job;
-    if (!(await patches) && !signal.aborted) cloud = (await fromResult(job, cloud, hooks, signal)) ?? cloud;
+    const isWhole = await Promise.race([patches, silence()]);
+    ended.abort(); // what comes late would be put over the result
+    if (!isWhole && !signal.aborted) cloud = (await fromResult(job, cloud, hooks, signal)) ?? cloud;
     clearTimeout(timer);
     if (cloud && !signal.aborted) hooks.onPoints({ isWhole: true });
     return job;
@@ -50,7 +63,7 @@ export async function followJob(id, { before, hooks, signal }) {
   }
 }
 
-// The patches are gone or broke off: take the positions from the result's file, where the page can read it.
+// The patches are gone, broke off or do not come: take the positions from the result's file, where the page can read it.
 async function fromResult(job, cloud, hooks, signal) {
   const { filename, bytes } = job.result;
   if (!canRead(filename, bytes)) {

@@ -17,6 +17,7 @@ export class Form {
       onFile(file);
     };
     parts.file.addEventListener("change", () => choose(parts.file.files[0]));
+    parts.file.addEventListener("click", () => (parts.file.value = "")); // else the same file again is no change
     parts.strength.addEventListener("input", () => this.showStrength());
     this.showStrength(); // browsers restore a form's values
     for (const kind of ["dragenter", "dragover"]) {

@@ -1,12 +1,13 @@
 // The jobs that this tab has sent: their ids are kept here, the rest is asked of the server.
 
-import { call, json } from "./api.js";
+import { call, json, pause } from "./api.js";
 import { element, offerDownload } from "./report.js";
 import * as text from "./text.js";
 
 const KEY = "straightpcf.jobs";
 const MOST = 50;
 const ASKED = 200;
+const FORGET_MS = [0, 1_000, 5_000]; // the server reads a file to its end before there is a job to delete
 const SAID = {
   queued: "waiting", starting: "starting", processing: "working", succeeded: "done", failed: "failed", canceled: "canceled",
   expired: "expired: its files are gone",
@@ -14,6 +15,24 @@ const SAID = {
 
 export function rememberJob(id) {
   sessionStorage.setItem(KEY, JSON.stringify([id, ...known().filter((other) => other !== id)].slice(0, MOST)));
+}
+
+// An id for a job to be made. randomUUID would be one, but is for HTTPS and localhost alone.
+export function newJobId() {
+  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+// Delete a job of which nobody heard whether it was made.
+export async function forgetJob(id) {
+  for (const wait of FORGET_MS) {
+    await pause(wait);
+    try {
+      await call(`jobs/${encodeURIComponent(id)}`, { method: "DELETE", keepalive: true });
+      return;
+    } catch (error) {
+      if (error.status && error.status !== 404) return;
+    }
+  }
 }
 
 // Fill `list`, and show `section` if there is anything in it.

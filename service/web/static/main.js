@@ -4,12 +4,14 @@ import { Problem, apiKey, call, json, keepApiKey, upload } from "./api.js";
 import { Cloud } from "./cloud.js";
 import { followJob, thinning } from "./follow.js";
 import { Form } from "./form.js";
-import { rememberJob, showJobs } from "./jobs.js";
+import { forgetJob, newJobId, rememberJob, showJobs } from "./jobs.js";
 import { canRead, readFile } from "./read/reader.js";
 import { suffixOf } from "./read/index.js";
 import { offerDownload, showReport } from "./report.js";
 import { Stage } from "./stage.js";
 import * as text from "./text.js";
+
+const BETWEEN = ["connection_failed", "error"]; // codes of what is not the server's own answer: it may have the file
 
 const parts = Object.fromEntries([...document.querySelectorAll("[id]")].map((part) => [part.id, part]));
 const stage = new Stage(parts);
@@ -24,15 +26,22 @@ parts.form.addEventListener("submit", (event) => {
   send().catch(showProblem);
 });
 parts.cancel.addEventListener("click", () => cancel().catch(showProblem));
-parts.key.addEventListener("change", () => {
-  parts.error.hidden = true; // it was of the key before
-  keepApiKey(parts.key.value.trim());
-  begin();
+parts.key.addEventListener("change", takeKey);
+parts.key.addEventListener("keydown", (event) => {
+  if (event.key !== "Enter") return;
+  event.preventDefault(); // it would send the form
+  takeKey();
 });
 parts["jobs-refresh"].addEventListener("click", listJobs);
 parts.key.value = apiKey(); // a reload keeps it
 parts["key-row"].hidden = !apiKey();
 begin();
+
+function takeKey() {
+  parts.error.hidden = true; // it was of the key before
+  keepApiKey(parts.key.value.trim());
+  begin();
+}
 
 function begin() {
   json("v1/info").then((info) => form.showInfo(info)).catch(showProblem);
@@ -89,18 +98,20 @@ async function send() {
   const { file } = form;
   const abort = new AbortController();
   const mine = (run = { id: null, abort });
+  const id = newJobId(); // so that the job can be deleted even if the answer never comes
   busy(true);
   say("Sending", 0);
   try {
     const onProgress = (share) => say(`Sending, ${Math.round(100 * share)} %`, share);
-    const job = await upload(`jobs?${form.query()}`, file, { onProgress, signal: abort.signal });
-    mine.id = job.id;
-    files.set(job.id, file);
-    rememberJob(job.id);
+    await upload(`jobs/${id}?${form.query()}`, file, { onProgress, signal: abort.signal });
+    mine.id = id;
+    files.set(id, file);
+    rememberJob(id);
     listJobs();
-    await follow(job.id, await readingOf(file), abort.signal);
+    await follow(id, await readingOf(file), abort.signal);
   } catch (error) {
     if (run === mine) parts.progress.hidden = true;
+    if (mine.id === null && (abort.signal.aborted || BETWEEN.includes(error.code))) forgetJob(id);
     if (!abort.signal.aborted) throw error;
     if (run === mine && mine.id === null) speak("Canceled");
   } finally {

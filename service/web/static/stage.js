@@ -85,8 +85,9 @@ export class Stage {
     if (!range) return;
     this.viewer.setRange(range.low, range.top);
     parts["legend-title"].textContent = cloud.hasBefore ? "moved, in the file’s unit" : "height z, in the file’s unit";
-    parts["legend-low"].textContent = text.length(range.low);
-    parts["legend-top"].textContent = cloud.hasBefore ? `${text.length(range.top)} and more` : text.length(range.top);
+    const [low, top] = text.ends(range.low, range.top);
+    parts["legend-low"].textContent = low;
+    parts["legend-top"].textContent = cloud.hasBefore && range.top > range.low ? `${top} and more` : top;
   }
 
   blend(value) {

@@ -1,6 +1,7 @@
 // Numbers as people read them.
 
 const LOCALE = "en";
+const MOST_DIGITS = 15; // what a double is good for
 
 export function count(value) {
   return value.toLocaleString(LOCALE);
@@ -12,11 +13,21 @@ export function bytes(value) {
   return `${trimmed((value / 1024 ** step).toFixed(digits))} ${["B", "KiB", "MiB", "GiB", "TiB"][step]}`;
 }
 
-export function length(value) {
+// digits: those that count; before the point all are shown.
+export function length(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "unknown";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  return size >= 1e5 || size < 1e-4 ? value.toExponential(2) : trimmed(value.toPrecision(3));
+  if (size >= 1e5 || size < 1e-4) return value.toExponential(digits - 1);
+  return value.toLocaleString(LOCALE, { maximumFractionDigits: Math.max(digits - 1 - Math.floor(Math.log10(size)), 0) });
+}
+
+// Two lengths with as many digits as tell them apart.
+export function ends(low, top) {
+  for (let digits = 3; ; digits++) {
+    const texts = [length(low, digits), length(top, digits)];
+    if (texts[0] !== texts[1] || low === top || digits === MOST_DIGITS) return texts;
+  }
 }
 
 export function seconds(value) {

@@ -22,7 +22,7 @@ const VERTEX = `
     gl_Position = projectionMatrix * seen;
     gl_PointSize = there ? size : 0.0;
     if (!there) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-    vec3 colour = known ? texture(colours, vec2(clamp((after.w - low) / (top - low), 0.0, 1.0), 0.5)).rgb : plain;
+    vec3 colour = known ? texture(colours, vec2(clamp((after.w - low) / (top > low ? top - low : 1.0), 0.0, 1.0), 0.5)).rgb : plain;
     // What is farther away fades a little: depth without light.
     float depth = clamp((-seen.z - middle) / (2.0 * radius) + 0.5, 0.0, 1.0);
     tint = mix(colour, back, 0.45 * depth);

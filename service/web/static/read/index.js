@@ -2,13 +2,13 @@
 
 import { readNpy } from "./npy.js";
 import { readPly } from "./ply.js";
-import { readXyz } from "./xyz.js";
+import { MARKS, readXyz } from "./xyz.js";
 
-export const READABLE = [".ply", ".npy", ".xyz", ".txt", ".asc", ".csv", ".pts"];
+const TEXT = [".xyz", ".txt", ".asc", ".xyzn", ".xyzrgb", ".csv", ".tsv", ".pts"];
+
+export const READABLE = [".ply", ".npy", ...TEXT];
 export const MAX_READ_BYTES = 1 << 30;
 export const MAX_SHOWN = 2_000_000;
-
-const TEXT = [".xyz", ".txt", ".asc", ".csv", ".pts"];
 
 export function suffixOf(name) {
   return name.includes(".") ? name.slice(name.lastIndexOf(".")).toLowerCase() : "";
@@ -18,7 +18,7 @@ export function suffixOf(name) {
 export function readPositions(bytes, name) {
   if (bytes[0] === 0x93 && bytes[1] === 0x4e && bytes[2] === 0x55) return readNpy(bytes);
   if (bytes[0] === 0x70 && bytes[1] === 0x6c && bytes[2] === 0x79 && bytes[3] <= 32) return readPly(bytes);
-  if (TEXT.includes(suffixOf(name))) return readXyz(bytes);
+  if (TEXT.includes(suffixOf(name))) return readXyz(bytes, suffixOf(name) === ".tsv" ? ["\t", ...MARKS] : MARKS);
   throw new Error("a format that this page does not read");
 }
 

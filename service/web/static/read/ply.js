@@ -14,10 +14,16 @@ export function readPly(bytes) {
   const at = elements.findIndex((element) => element.name === "vertex");
   if (at < 0) throw new Error("no element vertex");
   const vertex = elements[at];
-  const axes = ["x", "y", "z"].map((axis) => vertex.properties.findIndex((property) => property.name === axis));
+  const axes = axesAmong(vertex.properties.map((property) => property.name));
   if (axes.includes(-1)) throw new Error("no x, y, z");
   if (encoding === "ascii") return asciiRows(bytes, size, elements.slice(0, at), vertex, axes);
   return binaryRows(bytes, size, elements.slice(0, at), vertex, axes, encoding === "binary_little_endian");
+}
+
+// Where x y z are, or X Y Z where there are those alone.
+function axesAmong(names) {
+  const isSmall = ["x", "y", "z"].some((axis) => names.includes(axis));
+  return (isSmall ? ["x", "y", "z"] : ["X", "Y", "Z"]).map((axis) => names.indexOf(axis));
 }
 
 function header(bytes) {

@@ -1,7 +1,8 @@
-// Positions of a text table (.xyz .txt .asc .csv .pts), by the rules of points/formats/xyz.py and titles.py.
+// Positions of a text table (.xyz .csv .tsv .pts and the like), by the rules of points/formats/xyz.py and titles.py.
 
 import { Rows, eachLine, isSpace, readColumns } from "./lines.js";
 
+export const MARKS = [";", ","]; // what may stand between cells where it is not white space: the first that a row has
 const POSITIONS = [
   ["x", "y", "z"],
   ["points:0", "points:1", "points:2"],
@@ -21,8 +22,10 @@ const NUMBER = /^[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan(\((ind|snan)\))?|inf(in
 const SEPARATOR = /^"?sep=.?"?$/i; // Excel's first line
 const MISSING = ["", "na", "null"]; // a cell of a delimited table without a number
 const REMARKS = 20; // the last comments above a table, of which one may be its title
+const COUNTED = 10; // points: of fewer, an x may go up by one each
+const TAB = 9;
 
-export function readXyz(bytes) {
+export function readXyz(bytes, marks = MARKS) {
   const rows = new Rows();
   let table = null;
   let declared = null;
@@ -30,62 +33,94 @@ export function readXyz(bytes) {
   const remarks = []; // the last one first
   const begin = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf ? 3 : 0;
   let numbered = null; // a line that is pandas' 0, 1, 2... or a point: the next one tells
+  let counting = null; // whether x only counts the points, of a table without names
   const row = (text, start, end) => {
     const at = rows.next(); // may replace rows.values
     readColumns(text, start, end, table.delimiter, table.axes, rows.values, at);
+    if (counting?.isSo) counting.add(rows.values[at], text.slice(start, end));
+  };
+  const below = (line) => {
+    table = layout(line, names, remarks, marks);
+    if (!table.isNamed && declared === null) counting = new Counting(table.delimiter);
   };
   const above = (text, start, end, line, isComment) => {
+    if (!line) return;
     if (isComment || SEPARATOR.test(line)) {
       remarks.unshift(line.replace(/^[#/ ]+/, ""));
       remarks.length = Math.min(remarks.length, REMARKS);
     } else if (declared === null && !names && /^\d{1,18}$/.test(line)) declared = Number(line);
-    else if (!names && areNames(line)) names = line.replace(/^[% ]+/, "");
-    else if (!names && numbered === null && areNumbers(line)) numbered = { text, start, end, line };
-    else table = layout(line, names, remarks);
+    else if (!names && areNames(line, marks)) names = line.replace(/^[% ]+/, "");
+    else if (!names && numbered === null && areNumbers(line, marks)) numbered = { text, start, end, line };
+    else below(line);
   };
   const decide = (following) => {
     const { text, start, end, line } = numbered;
-    if (goesUnder(line, following)) names = line;
+    if (goesUnder(line, following, marks)) names = line;
     else {
-      table = layout(line, names, remarks);
+      below(line);
       row(text, start, end);
     }
     numbered = null;
   };
   eachLine(bytes, begin, (text, start, end) => {
-    while (start < end && isSpace(text.charCodeAt(start))) start++;
-    if (numbered) decide(strip(text.slice(start, end)));
+    if (numbered) decide(bare(text.slice(start, end), marks));
+    const isTabbed = table ? table.delimiter === TAB : marks.includes("\t"); // a tab at the start is behind an empty cell
+    while (start < end && isSpace(text.charCodeAt(start)) && !(isTabbed && text.charCodeAt(start) === TAB)) start++;
     if (start === end) return;
     const isComment = text[start] === "#" || (text[start] === "/" && text[start + 1] === "/");
-    if (table === null) above(text, start, end, strip(text.slice(start, end)), isComment);
+    if (table === null) above(text, start, end, bare(text.slice(start, end), marks), isComment);
     // One number below a number of points is that of one more scan.
     if (table === null || isComment || (declared !== null && /^[^ \t-\r,;]+\s*$/.test(text.slice(start, end)))) return;
     row(text, start, end);
   });
   if (numbered) decide("");
+  if (counting?.isRefused) throw new Error("the first column counts the points, and nothing says which are x, y, z");
   return rows.xyz;
 }
 
-function layout(line, names, remarks) {
-  const cells = words(line);
-  const delimiter = (delimiterOf(line) ?? "\0").charCodeAt(0);
+// As the server does, which refuses such a table: whether a first column counts the points, beside a fourth of numbers.
+class Counting {
+  constructor(delimiter) {
+    this.marks = delimiter ? [String.fromCharCode(delimiter)] : [];
+    this.isSo = true;
+    this.hasFourth = false;
+    this.first = null;
+    this.count = 0;
+  }
+
+  add(x, line) {
+    const cell = words(line, this.marks)[3] ?? "";
+    const isNumber = NUMBER.test(cell) || (this.marks.length > 0 && MISSING.includes(cell.toLowerCase()));
+    this.first ??= x;
+    this.isSo = isNumber && Number.isInteger(this.first) && x === this.first + this.count++;
+    this.hasFourth ||= cell !== "";
+  }
+
+  get isRefused() {
+    return this.isSo && this.hasFourth && this.count >= COUNTED;
+  }
+}
+
+function layout(line, names, remarks, marks) {
+  const cells = words(line, marks);
+  const delimiter = (delimiterOf(line, marks) ?? "\0").charCodeAt(0);
   for (const title of [names, ...remarks]) {
-    const fitting = meant(title).map((labels) => fitted(labels, cells)).filter((labels) => labels !== null);
+    const fitting = meant(title, marks).map((labels) => fitted(labels, cells)).filter((labels) => labels !== null);
     const axes = fitting.map(axesOf).find((found) => found !== null);
-    if (axes) return { delimiter, axes };
-    const isRefused = fitting.length > 0 || meant(title).some((labels) => axesOf(labels) !== null);
+    if (axes) return { delimiter, axes, isNamed: true };
+    const isRefused = fitting.length > 0 || meant(title, marks).some((labels) => axesOf(labels) !== null);
     if (title && title === names && cells.length > 3 && isRefused) throw new Error("names that do not say x, y, z");
   }
-  return { delimiter, axes: [0, 1, 2] };
+  return { delimiter, axes: [0, 1, 2], isNamed: false };
 }
 
 // The names in a title as they may be meant: `x [m]` as one, `Point Id` between tabs, `columns: x y z`.
-function meant(title) {
+function meant(title, marks) {
   if (!title) return [];
   const ways = [];
   for (const text of [title, title.replace(LEAD, "")]) {
-    ways.push(words(text));
-    if (delimiterOf(text) === undefined) ways.push(text.split("\t"), words(text.replace(BEFORE_UNIT, "")));
+    ways.push(words(text, marks));
+    if (delimiterOf(text, marks) === undefined) ways.push(text.split("\t"), words(text.replace(BEFORE_UNIT, ""), marks));
   }
   return ways.map((labels) => labels.map((label) => label.replace(/^["' ]+|["' ]+$/g, "")));
 }
@@ -112,9 +147,9 @@ function swapcase(label) {
   return label.replace(/[a-z]/gi, (letter) => (letter < "a" ? letter.toLowerCase() : letter.toUpperCase()));
 }
 
-function delimiterOf(line) {
-  const bare = byQuotes(line).filter((_, part) => part % 2 === 0).join("");
-  return [";", ","].find((mark) => bare.includes(mark));
+function delimiterOf(line, marks) {
+  const unquoted = byQuotes(line).filter((_, part) => part % 2 === 0).join("");
+  return marks.find((mark) => unquoted.includes(mark));
 }
 
 // White space as the server has it: not what is one in Latin-1 only, half of a letter in UTF-8.
@@ -122,12 +157,16 @@ function strip(text) {
   return text.replace(/^[ \t-\r]+|[ \t-\r]+$/g, "");
 }
 
+// The same, but for tabs that stand beside an empty cell.
+function bare(text, marks) {
+  return marks.includes("\t") && strip(text) ? text.replace(/^[ \n-\r]+|[ \n-\r]+$/g, "") : strip(text);
+}
+
 // The cells of a line, their quotes taken off.
-function words(line) {
-  const text = strip(line);
-  const mark = delimiterOf(text);
-  if (!mark) return text ? text.split(/[ \t-\r]+/) : [];
-  const parts = byQuotes(text).map((part, number) => (number % 2 ? part.replaceAll(mark, "\0") : part));
+function words(line, marks) {
+  const mark = delimiterOf(line, marks);
+  if (!mark) return strip(line) ? strip(line).split(/[ \t-\r]+/) : [];
+  const parts = byQuotes(line).map((part, number) => (number % 2 ? part.replaceAll(mark, "\0") : part));
   return parts.join('"').split(mark).map((word) => word.replaceAll("\0", mark).replace(/^[" \t-\r]+|[" \t-\r]+$/g, ""));
 }
 
@@ -137,22 +176,22 @@ function byQuotes(line) {
   return parts.length % 2 ? parts : [line];
 }
 
-function areNames(line) {
-  const labels = words(line);
-  const hasGaps = delimiterOf(line) && labels.every((label) => MISSING.includes(label.toLowerCase()));
+function areNames(line, marks) {
+  const labels = words(line, marks);
+  const hasGaps = delimiterOf(line, marks) && labels.every((label) => MISSING.includes(label.toLowerCase()));
   return labels.length >= 3 && !hasGaps && !labels.some((label) => NUMBER.test(label));
 }
 
 // 0, 1, 2..., behind the empty name of an index perhaps.
-function areNumbers(line) {
-  const labels = words(line);
+function areNumbers(line, marks) {
+  const labels = words(line, marks);
   const lead = labels[0] === "" ? 1 : 0;
   return labels.length >= lead + 3 && labels.slice(lead).every((label, column) => label === String(column));
 }
 
 // Whether a line is one of numbers of columns: the row under it has as many cells, and no position is a whole number.
-function goesUnder(line, following) {
-  const [labels, cells] = [words(line), words(following)];
+function goesUnder(line, following, marks) {
+  const [labels, cells] = [line, following].map((text) => words(text, marks));
   const lead = labels[0] === "" ? 1 : 0;
   return cells.length === labels.length && !cells.slice(lead, lead + 3).some((cell) => /^[-+]*\d+$/.test(cell));
 }
