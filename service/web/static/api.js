@@ -99,7 +99,7 @@ function parsed(status, text, requestId) {
   try {
     return JSON.parse(text);
   } catch {
-    const detail = "The answer is not this server's: a proxy before it may want you to log in. Reload the page.";
+    const detail = "The answer is not this server’s: a proxy before it may want you to log in. Reload the page.";
     throw new Problem({ status, code: "error", detail, requestId: requestId ?? "" });
   }
 }
