@@ -124,7 +124,7 @@ class JobStore:
         query = f"SELECT * FROM jobs WHERE {' AND '.join(where)} ORDER BY seq DESC LIMIT ?"
         rows = self._db.execute(query, [*values, limit + 1]).fetchall()
         more = len(rows) > limit
-        queue = self._queue(max((row["seq"] for row in rows), default=0))
+        queue = self._queue(max((row["seq"] for row in rows if row["state"] == "queued"), default=0))
         records = [self._record(row, queue) for row in rows[:limit]]
         return records, str(rows[limit - 1]["seq"]) if more else None
 

@@ -121,9 +121,7 @@ class Large(ObedientBackend):
 def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    backend = Large()
-    backend.go.set()
-    backend.finish.set()
+    backend = willing(Large())
 
     async def scenario() -> None:
         async with (
@@ -149,9 +147,7 @@ def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(
 @pytest.mark.parametrize("letter", ["q", "点"])
 def test_an_error_of_any_length_arrives_as_what_it_is(tmp_path: Path, letter: str) -> None:
     text = letter * 20_000
-    backend = ObedientBackend(MalformedFile(text))
-    backend.go.set()
-    backend.finish.set()
+    backend = willing(ObedientBackend(MalformedFile(text)))
 
     async def scenario() -> None:
         async with (

@@ -25,8 +25,8 @@ def play(scenario: Callable[[], Coroutine[Any, Any, None]]) -> None:
     asyncio.run(asyncio.wait_for(scenario(), timeout=20))
 
 
-def willing() -> ObedientBackend:
-    backend = ObedientBackend()
+def willing(backend: ObedientBackend | None = None) -> ObedientBackend:
+    backend = backend or ObedientBackend()
     backend.go.set()
     backend.finish.set()
     return backend
