@@ -26,6 +26,7 @@ __all__ = ["Caller", "Context", "answering"]
 
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
+_CANCELLED_WITHIN_SECONDS = 1.0
 
 Context: TypeAlias = grpc.aio.ServicerContext[Any, Any]
 
@@ -59,10 +60,11 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
     except StraightPCFError as error:
         status = GRPC_STATUS_BY_CODE[error.code]
         await _abort(context, error, id)
-    except grpc.aio.InternalError as ended:  # by the caller, or by its deadline, in the midst of a write
-        status = "CANCELLED"
-        raise asyncio.CancelledError from ended
     except Exception as fault:
+        if isinstance(fault, grpc.aio.InternalError):
+            # A write fails so in whose midst the caller ended the call, or its deadline; grpc then cancels this task.
+            status = "CANCELLED"
+            await asyncio.sleep(_CANCELLED_WITHIN_SECONDS)
         passing = busy(fault) if isinstance(fault, OSError) else None
         if passing is None:
             logger.exception("request %s: %s failed", id, method)
