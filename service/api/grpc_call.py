@@ -12,10 +12,11 @@ from typing import Any, Never, TypeAlias
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.duration_pb2 import Duration
+from google.protobuf.message import DecodeError
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from straightpcf.points.errors import InternalError, StraightPCFError
+from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS, busy
 from straightpcf.service.api.intake import checked_key
@@ -65,10 +66,10 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
             # A write fails so in whose midst the caller ended the call, or its deadline; grpc then cancels this task.
             status = "CANCELLED"
             await asyncio.sleep(_CANCELLED_WITHIN_SECONDS)
-        passing = busy(fault) if isinstance(fault, OSError) else None
-        if passing is None:
+        told = _explained(fault)
+        if told is None:
             logger.exception("request %s: %s failed", id, method)
-        told = passing or InternalError("the server met an error of its own")
+            told = InternalError("the server met an error of its own")
         status = GRPC_STATUS_BY_CODE[told.code]
         await _abort(context, told, id)
     except BaseException:
@@ -76,6 +77,12 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
         raise
     finally:
         telemetry.grpc_requests.labels(method, status).inc()
+
+
+def _explained(fault: Exception) -> StraightPCFError | None:
+    if isinstance(fault, DecodeError):
+        return InvalidRequest(f"a message of the call is none of this service's schema: {fault}")
+    return busy(fault) if isinstance(fault, OSError) else None
 
 
 async def _abort(context: Context, error: StraightPCFError, request_id: str) -> Never:
