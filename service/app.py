@@ -23,6 +23,7 @@ from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
 from straightpcf.service.api.hosts import HostMiddleware, is_loopback
+from straightpcf.service.api.intake import Coming
 from straightpcf.service.api.jobs import router as jobs_router
 from straightpcf.service.api.openapi import document_problems
 from straightpcf.service.api.request_id import RequestIdMiddleware
@@ -79,6 +80,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         if isinstance(route, Route) and route.methods:
             route.methods.add("HEAD")  # as everywhere
     app.state.engine = engine
+    app.state.coming = Coming()
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
     origins = tuple(origin.strip() for origin in settings.cors_origins.split(",") if origin.strip())

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import PurePosixPath, PureWindowsPath
 
 from starlette.requests import Request
 
-from straightpcf.points.errors import InvalidOptions, InvalidRequest
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, NotFound
 from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.api.body import declared_size, receive_upload
 from straightpcf.service.engine import Engine, JobRequest
 from straightpcf.service.jobs.record import JobRecord
 
-__all__ = ["checked_key", "file_name", "flag", "take_job"]
+__all__ = ["Coming", "checked_key", "file_name", "flag", "take_job"]
 
 OPTION_FIELDS = frozenset({"iterations", "seed", "strength", "normals"})
 KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
@@ -23,10 +24,54 @@ MAX_NAME_LENGTH = 120
 MAX_KEY_LENGTH = 255
 
 
+class Coming:
+    """Know the jobs whose files are on their way: one that is deleted meanwhile is not to be.
+
+    Who cancels an upload deletes its job over another connection, and the rest of the file may still lie in buffers.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: dict[object, tuple[str, str]] = {}  # owner and id, by upload
+
+    @contextmanager
+    def noted(self, owner: str, id: str | None) -> Iterator[Callable[[], bool]]:
+        """Note an upload; lends what tells whether its job was deleted since."""
+        upload = object()
+        if id is not None:
+            self._jobs[upload] = (owner, id)
+        try:
+            yield lambda: id is not None and upload not in self._jobs
+        finally:
+            self._jobs.pop(upload, None)
+
+    def delete(self, owner: str, id: str) -> bool:
+        """Let none of the uploads of a job make it; return whether there are any."""
+        uploads = [upload for upload, job in self._jobs.items() if job == (owner, id)]
+        for upload in uploads:
+            del self._jobs[upload]
+        return bool(uploads)
+
+
 async def take_job(
     request: Request, owner: str, *, endpoint: str, id: str | None = None, more_fields: frozenset[str] = frozenset()
 ) -> tuple[JobRecord, bool, Mapping[str, str]]:
-    """Receive the body and commit the job; return it, whether it is new, and every field that came with it."""
+    """Receive the body and commit the job; return it, whether it is new, and every field that came with it.
+
+    Raises NotFound where the job is deleted meanwhile.
+    """
+    coming: Coming = request.app.state.coming
+    with coming.noted(owner, id) as is_deleted:
+        record, created, fields = await _take(request, owner, endpoint, id, more_fields)
+        if created and is_deleted():
+            engine: Engine = request.app.state.engine
+            await engine.delete(record.id, owner=owner)
+            raise NotFound(f"job {record.id} was deleted while its file was on its way")
+    return record, created, fields
+
+
+async def _take(
+    request: Request, owner: str, endpoint: str, id: str | None, more_fields: frozenset[str]
+) -> tuple[JobRecord, bool, Mapping[str, str]]:
     engine: Engine = request.app.state.engine
     key = checked_key(request.headers.get("idempotency-key"))
     await engine.check_room(size=declared_size(request), owner=owner, id=id, idempotency_key=key)

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.errors import InvalidRequest, NotFound
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import open_result, result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
-from straightpcf.service.api.intake import take_job
+from straightpcf.service.api.intake import Coming, take_job
 from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.openapi import (
     EVENTS_PARAMETERS,
@@ -54,8 +54,8 @@ async def create_job(request: Request, owner: Owner) -> Response:
 
 
 @router.put(
-    "/jobs/{id}", status_code=202, response_model=Job, responses=JOB_RESPONSES, summary="Make a job with a chosen id",
-    openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
+    "/jobs/{id}", status_code=202, response_model=Job, responses={**JOB_RESPONSES, **problems(404)},
+    summary="Make a job with a chosen id", openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
 )  # fmt: skip
 async def put_job(id: str, request: Request, owner: Owner) -> Response:
     """Make a job once, however often the same request comes."""
@@ -126,9 +126,15 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
 
 @router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")
 async def delete_job(id: str, request: Request, owner: Owner) -> None:
-    """Remove a job, its files and its events, whatever its state."""
+    """Remove a job, its files and its events, whatever its state; also one whose file is still on its way."""
     engine: Engine = request.app.state.engine
-    await engine.delete(id, owner=owner)
+    coming: Coming = request.app.state.coming
+    is_coming = coming.delete(owner, id)
+    try:
+        await engine.delete(id, owner=owner)
+    except NotFound:
+        if not is_coming:
+            raise
 
 
 async def _result(id: str, request: Request, owner: Owner) -> Response:

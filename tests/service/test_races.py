@@ -104,6 +104,26 @@ def test_a_client_that_goes_away_while_its_job_is_committed_leaves_none(
     play(scenario)
 
 
+def test_a_job_that_is_deleted_while_its_file_is_on_its_way_is_none(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            put = POST.replace(b"POST /denoise", b"PUT /jobs/mine")
+            writer.write(put[:-6])
+            await until(lambda: any((tmp_path / "incoming").iterdir()))
+            async with httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http:
+                assert (await http.delete("/jobs/mine")).status_code == 204
+                assert (await http.delete("/jobs/other")).status_code == 404
+            writer.write(put[-6:])
+            assert b'"not_found"' in await _answer(reader)
+            assert (await engine.list())[0] == []
+            writer.write(put)  # the next one is another
+            assert b'"mine"' in await _answer(reader)
+            writer.close()
+
+    play(scenario)
+
+
 class Commit:
     """Hold a job's commit back, once it is made, until `may_end` is set."""
 
