@@ -26,6 +26,7 @@ _POSITIVE = (
 )  # fmt: skip
 _SECONDS = ("max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "row_ttl_seconds", "shutdown_seconds")
 _MAX_SECONDS = 1e9  # three decades; infinitely far ahead there is no date
+_MAX_WHOLE = 2**63 - 1  # what SQLite and gRPC hold
 
 
 def _default_data_dir() -> Path:
@@ -93,6 +94,9 @@ class Settings:
         for name in _SECONDS:
             if not getattr(self, name) <= _MAX_SECONDS:  # NaN is not, either
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be at most {_MAX_SECONDS:.0f}")
+        for name in (spec.name for spec in dataclasses.fields(self)):
+            if isinstance(value := getattr(self, name), int) and value > _MAX_WHOLE:
+                raise InvalidOptions(f"{name} is {str(value)[:40]}; it must be at most {_MAX_WHOLE}")
         for name in ("port", "grpc_port"):
             if not 0 <= (getattr(self, name) or 0) < 2**16:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")

@@ -12,10 +12,11 @@ from typing import Any, Never, TypeAlias
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.duration_pb2 import Duration
+from google.protobuf.message import DecodeError
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from straightpcf.points.errors import InternalError, StraightPCFError
+from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS, busy
 from straightpcf.service.api.intake import checked_key
@@ -26,6 +27,7 @@ __all__ = ["Caller", "Context", "answering"]
 
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
+_CANCELLED_WITHIN_SECONDS = 1.0
 
 Context: TypeAlias = grpc.aio.ServicerContext[Any, Any]
 
@@ -59,14 +61,15 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
     except StraightPCFError as error:
         status = GRPC_STATUS_BY_CODE[error.code]
         await _abort(context, error, id)
-    except grpc.aio.InternalError as ended:  # by the caller, or by its deadline, in the midst of a write
-        status = "CANCELLED"
-        raise asyncio.CancelledError from ended
     except Exception as fault:
-        passing = busy(fault) if isinstance(fault, OSError) else None
-        if passing is None:
+        if isinstance(fault, grpc.aio.InternalError):
+            # A write fails so in whose midst the caller ended the call, or its deadline; grpc then cancels this task.
+            status = "CANCELLED"
+            await asyncio.sleep(_CANCELLED_WITHIN_SECONDS)
+        told = _explained(fault)
+        if told is None:
             logger.exception("request %s: %s failed", id, method)
-        told = passing or InternalError("the server met an error of its own")
+            told = InternalError("the server met an error of its own")
         status = GRPC_STATUS_BY_CODE[told.code]
         await _abort(context, told, id)
     except BaseException:
@@ -74,6 +77,12 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
         raise
     finally:
         telemetry.grpc_requests.labels(method, status).inc()
+
+
+def _explained(fault: Exception) -> StraightPCFError | None:
+    if isinstance(fault, DecodeError):
+        return InvalidRequest(f"a message of the call is none of this service's schema: {fault}")
+    return busy(fault) if isinstance(fault, OSError) else None
 
 
 async def _abort(context: Context, error: StraightPCFError, request_id: str) -> Never:

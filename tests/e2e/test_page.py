@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -185,6 +186,19 @@ def test_a_result_is_shown_though_its_patches_never_come(page: Any, scan: Path) 
     page.wait_for_selector("#report:not([hidden])")
     assert held
     assert page.is_visible("#legend"), "the viewer has only the noisy cloud"
+
+
+def test_what_was_said_of_a_job_on_its_way_is_gone_from_below_its_result(
+    page: Any, server: RunningServer, tmp_path: Path
+) -> None:
+    np.save(large := tmp_path / "large.npy", noisy(sphere(6000), 0.01))
+    page.set_input_files("#file", large)
+    page.click("#submit")
+    page.wait_for_selector("#status:has-text('Pass')")
+    os.kill(server.worker_pid(), signal.SIGKILL)
+    page.wait_for_selector("#note:has-text('starts again')")
+    page.wait_for_selector("#report:not([hidden])", timeout=60_000)
+    assert page.inner_text("#note") == ""
 
 
 def test_deleting_what_is_shown_takes_it_away_and_keeps_the_focus(page: Any, scan: Path) -> None:

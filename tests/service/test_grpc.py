@@ -167,6 +167,13 @@ def test_a_call_against_the_contract_is_refused(stub: Any, name: str) -> None:
     }
 
 
+def test_a_stream_of_another_schema_is_the_callers_fault(server: RunningServer, channel: Any) -> None:
+    call = channel.stream_unary("/straightpcf.v1.DenoiseService/CreateJob")
+    status, info = error_of(lambda: call(iter([b"\xff\xff"])))
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "INVALID_REQUEST")
+    assert f"request {info.metadata['request_id']}" not in server.log.read_text()
+
+
 def test_states_may_be_asked_for_any_number_of_times(stub: Any) -> None:
     id = done(stub)
     asked = [pb.JOB_STATE_SUCCEEDED] * 300_000  # SQLite takes a tenth of that as values

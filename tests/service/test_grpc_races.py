@@ -17,6 +17,8 @@ grpc = pytest.importorskip("grpc")
 from straightpcf.points.errors import MalformedFile  # noqa: E402
 from straightpcf.points.wire import straightpcf_pb2 as pb  # noqa: E402
 from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub  # noqa: E402
+from straightpcf.service.api import grpc as grpc_calls  # noqa: E402
+from straightpcf.service.api import grpc_call  # noqa: E402
 from straightpcf.service.backends.base import FileJob, FileReport, Listener  # noqa: E402
 from straightpcf.service.engine import Engine  # noqa: E402
 from tests.service.engines import until  # noqa: E402
@@ -142,6 +144,31 @@ def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(
 
     play(scenario)
     assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_fault_of_grpc_that_no_caller_made_is_one_of_the_server(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def many_writes_at_once(service: object, request: object, context: Any) -> None:
+        async with service._answering(context, "DownloadResult"):  # type: ignore[attr-defined]
+            large = pb.DownloadResultResponse(chunk=bytes(1 << 20))
+            await asyncio.gather(*(context.write(large) for _ in range(9)))
+
+    monkeypatch.setattr(grpc_calls.DenoiseService, "DownloadResult", many_writes_at_once)
+    monkeypatch.setattr(grpc_call, "_CANCELLED_WITHIN_SECONDS", 0.1)
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, willing(), grpc_port=(port := free_port())) as (_, host, _),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+        ):
+            with pytest.raises(grpc.RpcError) as caught:
+                _ = [answer async for answer in DenoiseServiceStub(channel).DownloadResult(pb.DownloadResultRequest())]
+            assert caught.value.code().name == "INTERNAL"
+            assert "the server met an error of its own" in caught.value.details()
+
+    play(scenario)
+    assert [record for record in caplog.records if record.exc_info and "DownloadResult failed" in record.message]
 
 
 @pytest.mark.parametrize("letter", ["q", "点"])

@@ -137,6 +137,7 @@ def test_compose_lets_a_server_end_in_peace() -> None:
         ("STRAIGHTPCF_SERVICE", "10.0.0.1"),
         ("STRAIGHTPCF_PORT", "65536"),
         ("STRAIGHTPCF_MAX_JOBS", "0"),
+        ("STRAIGHTPCF_MAX_POINTS", "9223372036854775808"),
         ("STRAIGHTPCF_TILE_POINTS", "9999"),
         ("STRAIGHTPCF_RESULT_TTL_SECONDS", "inf"),
         ("STRAIGHTPCF_RESULT_TTL_SECONDS", "nan"),

@@ -126,13 +126,14 @@ async function follow(id, before, signal) {
   const hooks = {
     onEvent: showEvent,
     onCloud: (cloud, line) => stage.show(cloud, (note = line)),
-    onNote: (line) => stage.note(line),
+    onNote: (line) => stage.note((note = line)),
     onPoints: (how) => stage.refresh(how),
   };
   const job = await followJob(id, { before: before?.xyz ? before : null, hooks, signal });
   if (job.state === "succeeded") {
     parts.progress.hidden = true;
     speak("Done");
+    stage.note(note); // what was said on the way is over, or among the report's warnings
     showReport(job, parts);
     offerDownload(parts.download, job, showProblem);
     parts.report.hidden = false;
