@@ -103,13 +103,13 @@ class _Counting:
 
     def __init__(self, processor: Processor) -> None:
         self._processor, self.done = processor, list[tuple[int, int]]()
-        self.distances, self.spread, self.each = processor.distances, processor.spread, processor.each
+        self.distances, self.spread, self.mapper = processor.distances, processor.spread, processor.mapper
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         self.done += [(cut.index.shape[1], int(some)) for some in cut.owned]
-        return self._processor.displacements(here, cut, scales, probed, finish)
+        return self._processor.displacements(positions, cut, scales, known_distances, finish)
 
 
 def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:

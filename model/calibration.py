@@ -13,7 +13,7 @@ from straightpcf.points.errors import MalformedFile
 
 __all__ = ["Calibration"]
 
-_PLAIN = 0.8  # d of noise that one pass takes most of
+_ONE_PASS_DISTANCE = 0.8  # d of noise that one pass takes most of
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Calibration:
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
-        if done == 1 < due and start < _PLAIN and now > self.stuck * start:
+        if done == 1 < due and start < _ONE_PASS_DISTANCE and now > self.stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
         if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:

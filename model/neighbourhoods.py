@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-__all__ = ["INNER", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods"]
+__all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods"]
 
 Floats = npt.NDArray[np.float64]
 
 _LEAST_RADIUS = 1e-12  # of a cloud in the unit ball; where points are in one place, rounding is what is left
-INNER = 1 / 3  # of a patch's points, those whose neighbours are in the patch, too
+INNER_SHARE = 1 / 3  # of a patch's points, those whose neighbours are in the patch, too
 
 
 @dataclass(frozen=True)
@@ -73,4 +73,4 @@ def inner_points(points: Floats, *, whole: bool) -> Floats:
     whole: whether the patch is a whole cloud; then they are all.
     """
     middle = np.square(points - points.mean(axis=0)).sum(axis=1)
-    return points[np.argsort(middle)[: len(points) if whole else round(INNER * len(points))]]
+    return points[np.argsort(middle)[: len(points) if whole else round(INNER_SHARE * len(points))]]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.normalize import (
-    LOUD_NOISE,
+    HIGH_NOISE,
     is_scene,
     noise_in_radii,
     parts_of,
@@ -21,7 +21,7 @@ from straightpcf.model.normalize import (
 )
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
-from straightpcf.model.spacing import Lie
+from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling
 
 __all__ = ["NoiseReader", "Reading"]
@@ -29,14 +29,14 @@ __all__ = ["NoiseReader", "Reading"]
 # d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
 # From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
 # smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
-_AGAIN_ZOOMS, _AGAIN_PROBES, _AGAIN_POINTS = (0.5, 0.25), 24, 2500
-_AGAIN_FROM, _AGAIN_ABOVE = 0.4, 0.95
-# Where patches reach far, thin walls and bends are read as noise, so what is loud there is read once more, of more of
+_REREAD_ZOOMS, _REREAD_PROBES, _REREAD_POINTS = (0.5, 0.25), 24, 2500
+_REREAD_FROM, _REREAD_ABOVE = 0.4, 0.95
+# Where patches reach far, thin walls and bends are read as noise, so what is high there is read once more, of more of
 # the points shown at half their size, in patches no larger than this.
-_NEAR = 0.15
+_NEAR_RADIUS = 0.15
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
-_UNEVEN, _ENOUGH_PROBES = 2.0, 10
-_MOST_POINTS = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
+_UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
+_MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
 
 
 @dataclass(frozen=True)
@@ -44,24 +44,24 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; lie: how its points lie, before the first pass; zoom: the factor by which the pass shows an
+    object seen whole; sampling: how its points lie, before the first pass; zoom: the factor by which the pass shows an
     object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
-    patches, before the first pass (a scene's are all shown in one size, and d says as much); probed: what the
-    DistanceModule said of patches of that pass, by number; usual: the noise std that four fifths of a scene's points
-    have, or less; loud: whether an object has more noise than LOUD_NOISE, before the first pass; uneven: whether that
-    pass shows no patch larger than the noise in it asks for.
+    patches, before the first pass (a scene's are all shown in one size, and d says as much); known_distances: what the
+    DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a scene's
+    points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass; uneven:
+    whether that pass shows no patch larger than the noise in it asks for.
     """
 
     distance: float
     noise_std: float
     scene: bool
-    lie: Lie
+    sampling: Sampling
     zoom: float = 1.0
     parts: tuple[int, ...] = (1,)
     noise_in_radii: float = 0.0
-    probed: Mapping[int, float] = field(default_factory=dict)
-    usual: float = 0.0
-    loud: bool = False
+    known_distances: Mapping[int, float] = field(default_factory=dict)
+    noise_of_most: float = 0.0
+    high_noise: bool = False
     uneven: bool = False
 
 
@@ -73,9 +73,9 @@ class NoiseReader:
     ) -> None:
         """tile: cuts some of the points into patches. zoom: whether the noise changes what a pass does."""
         self._processor, self._calibration, self._tile, self._zoom = processor, calibration, tile, zoom
-        self._most = float(calibration.noise[-1])
+        self._largest_noise = float(calibration.noise[-1])
 
-    def read(self, here: Floats, tiling: Tiling, first: Reading | None) -> Reading:
+    def read(self, positions: Floats, tiling: Tiling, first: Reading | None) -> Reading:
         """Read the noise of a cloud; first: the reading before the first pass, None where this is it.
 
         What is a scene is said once: patches shrink as the noise goes. Where the pass shows the whole cloud in another
@@ -84,105 +84,116 @@ class NoiseReader:
         probes, numbers = tiling.probes()
         scene = is_scene(_quantile(probes.radii, probes.owned, 0.5)) if first is None else first.scene
         scales = patch_scales(probes.radii, scene=scene)
-        distances = self._processor.distances(here, probes, scales)
+        distances = self._processor.distances(positions, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         if scene:
-            noise, usual, parts = self._read_scene(here, tiling, probes, distances, scales, first=first is None)
-            probed = known if parts == (1,) else {}
-            return Reading(distance, noise, scene, Lie(scattered=True), parts=parts, probed=probed, usual=usual)
+            noise, of_most, parts = self._read_scene(positions, tiling, probes, distances, scales, first=first is None)
+            return Reading(
+                distance,
+                noise,
+                scene,
+                Sampling(irregular=True),
+                parts=parts,
+                known_distances=known if parts == (1,) else {},
+                noise_of_most=of_most,
+            )
         noise = self._noise_std(distances, scales)
-        zoom, parts, in_radii, loud, uneven = 1.0, (1,), 0.0, False, False
-        lie = Lie.of(here, probes, noise, each=self._processor.each) if first is None else first.lie
+        zoom, parts, in_radii, high_noise, uneven = 1.0, (1,), 0.0, False, False
+        mapper = self._processor.mapper
+        sampling = Sampling.of(positions, probes, noise, mapper=mapper) if first is None else first.sampling
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:
             if first is None:
-                noise = self._read_again(here, tiling, noise)
-                zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(here))
+                noise = self._reread(positions, tiling, noise)
+                zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(positions))
                 uneven = _is_uneven(self.noise_stds(distances, scales), zoom)
-                loud = noise > LOUD_NOISE and self._is_loud(here, tiling, noise, float(np.median(probes.radii)))
-            elif first.loud and noise > _AGAIN_FROM * self._most:
-                zoom = zoom_of_rest(noise, self._made_smaller(here, tiling, _AGAIN_ZOOMS[0]))
+                radius = float(np.median(probes.radii))
+                high_noise = noise > HIGH_NOISE and self._has_high_noise(positions, tiling, noise, radius)
+            elif first.high_noise and noise > _REREAD_FROM * self._largest_noise:
+                zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
         if uneven or parts != (1,):  # patches are shown in other sizes, or are others
-            return Reading(distance, noise, scene, lie, zoom, parts, in_radii, loud=loud, uneven=uneven)
+            return Reading(
+                distance, noise, scene, sampling, zoom, parts, in_radii, high_noise=high_noise, uneven=uneven
+            )
         if zoom != 1.0:
-            distances = self._processor.distances(here, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
+            distances = self._processor.distances(positions, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, lie, zoom, parts, in_radii, known, loud=loud)
+        return Reading(distance, noise, scene, sampling, zoom, parts, in_radii, known, high_noise=high_noise)
 
-    def zooms(self, here: Floats, cut: Patches, shown: Reading) -> Floats | float:
+    def zooms(self, positions: Floats, cut: Patches, reading: Reading) -> Floats | float:
         """Return the factor by which a pass shows its patches larger: of each, (M,), or of all."""
-        if not shown.uneven:
-            return shown.zoom
+        if not reading.uneven:
+            return reading.zoom
         scales = patch_scales(cut.radii, scene=False)
-        return zoom_of_each(self.noise_stds(self._processor.distances(here, cut, scales), scales), shown.zoom)
+        return zoom_of_each(self.noise_stds(self._processor.distances(positions, cut, scales), scales), reading.zoom)
 
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
         return self._calibration.noise_std(distances) / scales
 
-    def _read_again(self, here: Floats, tiling: Tiling, noise: float) -> float:
+    def _reread(self, positions: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""
-        most, enough = self._most, _AGAIN_FROM
-        for zoom in _AGAIN_ZOOMS:
+        most, enough = self._largest_noise, _REREAD_FROM
+        for zoom in _REREAD_ZOOMS:
             if noise < enough * most:
                 break
-            again = self._made_smaller(here, tiling, zoom)
-            if again < _AGAIN_ABOVE * most:
+            again = self._read_at_zoom(positions, tiling, zoom)
+            if again < _REREAD_ABOVE * most:
                 break
-            noise, most, enough = again, self._most / zoom, _AGAIN_ABOVE
+            noise, most, enough = again, self._largest_noise / zoom, _REREAD_ABOVE
         return noise
 
     def _read_scene(
-        self, here: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, *, first: bool
+        self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, *, first: bool
     ) -> tuple[float, float, tuple[int, ...]]:
         """Return the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
-        noise, usual = self._noise_of_scene(probes, distances, scales)
-        if np.isfinite(usual) or not (first and self._zoom):
-            return noise, usual, (1,)
-        noise, usual = self._read_scene_again(here, tiling, noise)
-        return noise, usual, parts_of(noise, probes.radii, len(here))
+        noise, noise_of_most = self._noise_of_scene(probes, distances, scales)
+        if np.isfinite(noise_of_most) or not (first and self._zoom):
+            return noise, noise_of_most, (1,)
+        noise, noise_of_most = self._reread_scene(positions, tiling, noise)
+        return noise, noise_of_most, parts_of(noise, probes.radii, len(positions))
 
     def _noise_of_scene(self, probes: Patches, distances: Floats, scales: Floats) -> tuple[float, float]:
         """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""
         shown = self._calibration.noise_std(distances)
-        noise, usual = (_quantile(shown / scales, probes.owned, share) for share in (0.5, _MOST_POINTS))
-        beyond = _quantile(shown, probes.owned, _MOST_POINTS) >= _AGAIN_ABOVE * self._most
-        return noise, np.inf if beyond else usual
+        noise, noise_of_most = (_quantile(shown / scales, probes.owned, share) for share in (0.5, _MOST_POINTS_SHARE))
+        beyond = _quantile(shown, probes.owned, _MOST_POINTS_SHARE) >= _REREAD_ABOVE * self._largest_noise
+        return noise, np.inf if beyond else noise_of_most
 
-    def _read_scene_again(self, here: Floats, tiling: Tiling, noise: float) -> tuple[float, float]:
+    def _reread_scene(self, positions: Floats, tiling: Tiling, noise: float) -> tuple[float, float]:
         """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
-        usual = np.inf
-        for zoom in _AGAIN_ZOOMS:
-            some = self._thinned(here, tiling, zoom)
-            probes, _ = self._tile(some).probes(_AGAIN_PROBES)
+        noise_of_most = np.inf
+        for zoom in _REREAD_ZOOMS:
+            some = self._subsampled(positions, tiling, zoom)
+            probes, _ = self._tile(some).probes(_REREAD_PROBES)
             scales = patch_scales(probes.radii, scene=True)
-            again, usual = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
+            again, noise_of_most = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
             noise = max(noise, again)
-            if np.isfinite(usual):
+            if np.isfinite(noise_of_most):
                 break
-        return noise, max(noise, usual)
+        return noise, max(noise, noise_of_most)
 
-    def _is_loud(self, here: Floats, tiling: Tiling, noise: float, radius: float) -> bool:
+    def _has_high_noise(self, positions: Floats, tiling: Tiling, noise: float, radius: float) -> bool:
         """Say whether an object with patches of a radius, whose noise was read far around, has that much."""
-        zoom = _AGAIN_ZOOMS[0]
-        thinned = max(zoom, radius * zoom / _NEAR)
-        if _parts(here, thinned) == _parts(here, zoom):  # what was read reaches no farther
+        zoom = _REREAD_ZOOMS[0]
+        thinned = max(zoom, radius * zoom / _NEAR_RADIUS)
+        if _parts(positions, thinned) == _parts(positions, zoom):  # what was read reaches no farther
             return True
-        near = self._read_smaller(self._thinned(here, tiling, thinned), zoom)
-        return (noise + near) / 2 > LOUD_NOISE
+        near = self._read_points_at_zoom(self._subsampled(positions, tiling, thinned), zoom)
+        return (noise + near) / 2 > HIGH_NOISE
 
-    def _thinned(self, here: Floats, tiling: Tiling, zoom: float) -> Floats:
+    def _subsampled(self, positions: Floats, tiling: Tiling, zoom: float) -> Floats:
         """Return so few points that patches are as large as before where they are shown zoom times their size."""
-        return here[tiling.parted(_parts(here, zoom))[0]]
+        return positions[tiling.subsamples(_parts(positions, zoom))[0]]
 
-    def _made_smaller(self, here: Floats, tiling: Tiling, zoom: float) -> float:
+    def _read_at_zoom(self, positions: Floats, tiling: Tiling, zoom: float) -> float:
         """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
-        return self._read_smaller(self._thinned(here, tiling, zoom), zoom)
+        return self._read_points_at_zoom(self._subsampled(positions, tiling, zoom), zoom)
 
-    def _read_smaller(self, some: Floats, zoom: float) -> float:
+    def _read_points_at_zoom(self, some: Floats, zoom: float) -> float:
         """Read the noise of some points of an object shown smaller."""
-        probes, _ = self._tile(some).probes(_AGAIN_PROBES)
+        probes, _ = self._tile(some).probes(_REREAD_PROBES)
         scales = patch_scales(probes.radii, scene=False, zoom=zoom)
         return self._noise_std(self._processor.distances(some, probes, scales), scales)
 
@@ -193,13 +204,13 @@ class NoiseReader:
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:
     """Say of the noise stds of some patches whether noise, not only shape, differs, and some must be shown smaller."""
     low, high = np.quantile(noise_stds, (0.1, 0.9))
-    loud = high > _UNEVEN * low and zoom_of_each(high, zoom) < zoom
-    return bool(loud) and len(noise_stds) >= _ENOUGH_PROBES
+    uneven = high > _UNEVEN_RATIO * low and zoom_of_each(high, zoom) < zoom
+    return bool(uneven) and len(noise_stds) >= _ENOUGH_PROBES
 
 
-def _parts(here: Floats, zoom: float) -> int:
-    """Return of how many parts of the points one is as few as `NoiseReader._thinned` asks for, and not too few."""
-    return max(1, min(round(1 / zoom**2), len(here) // _AGAIN_POINTS))
+def _parts(positions: Floats, zoom: float) -> int:
+    """Return of how many parts of the points one is as few as `NoiseReader._subsampled` asks for, and not too few."""
+    return max(1, min(round(1 / zoom**2), len(positions) // _REREAD_POINTS))
 
 
 def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> float:

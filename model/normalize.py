@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = [
-    "LOUD_NOISE",
+    "HIGH_NOISE",
     "CloudFrame",
     "is_scene",
     "noise_in_radii",
@@ -22,20 +22,20 @@ __all__ = [
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training-log.md, "The first run").
 _SMALLEST_RADIUS, _LARGEST_RADIUS = 0.1, 0.58
-_USUAL_RADIUS = 0.25  # their median
+_MEDIAN_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.03, 1.0
-_BEARABLE_NOISE = 0.044  # more is brought to this, below the least factor, too
+_LARGEST_SHOWN_NOISE = 0.044  # more is brought to this, below the least factor, too
 # Noise above a fifth more than any in training leaves waves, longer than what d knows for noise: see `zoom_of_rest`.
-LOUD_NOISE = 0.036
-_WAVY, _SHOWN_REST, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
+HIGH_NOISE = 0.036
+_WAVES_RATIO, _REST_NOISE, _SMALLEST_REST_ZOOM = 1.1, 0.013, 0.4
 _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
 # Of noise, in radii of a patch, for each part, and the range of these in which both 1 and 2 do: see `parts_of`. It
 # begins earlier where noise is so large that an object cannot be shown larger for it (`zoom_of`).
-_NOISE_A_PART, _BOTH = 0.062, (1.25, 1.75)
-_SHOWN_AS_IT_IS, _BOTH_THERE_FROM = 0.9 * _SHOWN_NOISE, 1.0
+_NOISE_PER_PART, _BOTH_RANGE = 0.062, (1.25, 1.75)
+_UNZOOMED_NOISE, _UNZOOMED_BOTH_FROM = 0.9 * _SHOWN_NOISE, 1.0
 _MOST_PARTS, _SMALLEST_PART = 6, 2000
 _BLOCK = 2**16  # rows whose distances are held at once
 
@@ -89,26 +89,26 @@ def zoom_of(
     """
     largest = np.clip(_LARGEST_ZOOMED_RADIUS / np.median(radii), 1.0, _LARGEST_ZOOM)
     noise_std = max(noise_std, 1e-9)
-    return float(np.clip(shown / noise_std, min(smallest, _BEARABLE_NOISE / noise_std), largest))
+    return float(np.clip(shown / noise_std, min(smallest, _LARGEST_SHOWN_NOISE / noise_std), largest))
 
 
 def zoom_of_each(noise_stds: npt.NDArray[np.float64], zoom: float) -> npt.NDArray[np.float64]:
     """Return the factors by which the first pass shows patches of noise stds (M,) larger: as `zoom_of`, `zoom` at most.
 
-    Where noise is not the same all over an object, its loud parts would be shown with more than the network bears.
+    Where noise is not the same all over an object, its noisiest parts would be shown with more than the network bears.
     """
     return np.clip(_SHOWN_NOISE / np.maximum(noise_stds, 1e-9), _SMALLEST_ZOOM, zoom)
 
 
 def zoom_of_rest(noise_std: float, at_half_size: float) -> float:
-    """Return the factor by which a later pass shows an object smaller, of which the first found more than LOUD_NOISE.
+    """Return the factor by which a later pass shows an object smaller, of which the first found more than HIGH_NOISE.
 
     noise_std: read of it as it is; at_half_size: of a quarter of its points, shown at half their size. Where more is
     seen there, what is left is longer than noise, and is brought to a size at which it looks like noise.
     """
-    if at_half_size < _WAVY * noise_std:
+    if at_half_size < _WAVES_RATIO * noise_std:
         return 1.0
-    return float(np.clip(_SHOWN_REST / max(at_half_size, 1e-9), _SMALLEST_REST_ZOOM, 1.0))
+    return float(np.clip(_REST_NOISE / max(at_half_size, 1e-9), _SMALLEST_REST_ZOOM, 1.0))
 
 
 def noise_in_radii(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
@@ -126,10 +126,10 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tu
     however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
     has patches of sqrt(m) times the radius, at the same cost (docs/filter.md, "Parts").
     """
-    wanted = noise_in_radii(noise_std, radii) / _NOISE_A_PART
+    wanted = noise_in_radii(noise_std, radii) / _NOISE_PER_PART
     most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
-    lowest = _BOTH[0] if noise_std < _SHOWN_AS_IT_IS else _BOTH_THERE_FROM
-    if lowest <= wanted < _BOTH[1] and most > 1:
+    lowest = _BOTH_RANGE[0] if noise_std < _UNZOOMED_NOISE else _UNZOOMED_BOTH_FROM
+    if lowest <= wanted < _BOTH_RANGE[1] and most > 1:
         return (1, 2)
     return (max(1, min(round(wanted), most)),)
 
@@ -145,5 +145,5 @@ def patch_scales(
     the upper one zoomed. One of radius 0 keeps the factor 1.
     """
     largest = np.maximum(1.0, zoom) * _LARGEST_RADIUS
-    wanted = np.clip(zoom * radii, _USUAL_RADIUS if scene else _SMALLEST_RADIUS, largest)
+    wanted = np.clip(zoom * radii, _MEDIAN_RADIUS if scene else _SMALLEST_RADIUS, largest)
     return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

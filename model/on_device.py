@@ -23,8 +23,8 @@ import torch
 from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
-from straightpcf.model.processor import Each, Finish, Floats, Forward, cut_out
-from straightpcf.model.spread import AROUND, spread_among
+from straightpcf.model.processor import Finish, Floats, Forward, Mapper, cut_out
+from straightpcf.model.spread import TANGENT_NEIGHBOURS, spread_among
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
 
@@ -126,23 +126,23 @@ class OnDevice:
         self.device, self.batch = torch.device(device), batch
         self._distances, self._graphs = distances, Graphs(forward, capture)
         self._pool = ThreadPoolExecutor(threads)
-        self.each: Each = self._pool.map
+        self.mapper: Mapper = self._pool.map
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Do what a Processor does; while the device computes a batch, the results of the one before are read.
 
         Raises TooLarge where it has no memory for one patch.
         """
-        points, held = self._sent(here, cut, scales, probed)
+        points, sent = self._sent(positions, cut, scales, known_distances)
         waiting: deque[tuple[range, _Result]] = deque()
         first = 0
         while first < len(cut.seeds):
             chosen = range(first, min(first + self.batch, len(cut.seeds)))
             try:
                 with current(self.device):
-                    moves = self._launch(points, cut, held, chosen)
+                    moves = self._launch(points, cut, sent, chosen)
                     waiting.append((chosen, _Result(moves[: len(chosen)])))
             except torch.OutOfMemoryError as exc:
                 self._halve(cut, exc)
@@ -154,36 +154,36 @@ class OnDevice:
             yield from self._finished(batch, result, cut, finish)
 
     @torch.inference_mode()
-    def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
+    def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,). Raises TooLarge as `displacements` does."""
-        points, held = self._sent(here, cut, scales, {})
+        points, sent = self._sent(positions, cut, scales, {})
         with current(self.device):
-            found = list(self._batched(cut, lambda batch: self._distances(held.cut_out(points, batch))))
+            found = list(self._batched(cut, lambda batch: self._distances(sent.cut_out(points, batch))))
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
     @torch.inference_mode()
-    def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
         """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before.
 
         Raises TooLarge where it has no memory for them.
         """
-        nearest = min(AROUND, PATCH_SIZE - 1, len(here) - 1)
-        with current(self.device), enough_memory(self.device, len(here)):
-            points = torch.from_numpy(here).to(self.device)
+        nearest = min(TANGENT_NEIGHBOURS, PATCH_SIZE - 1, len(positions) - 1)
+        with current(self.device), enough_memory(self.device, len(positions)):
+            points = torch.from_numpy(positions).to(self.device)
             around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
             for cut in tiling.cuts():
-                held = _Held.of(cut, np.ones(len(cut.seeds)), {}, self.device)
-                for _ in self._batched(cut, partial(_look_around, points, cut, held, around)):
+                sent = _DeviceCut.of(cut, np.ones(len(cut.seeds)), {}, self.device)
+                for _ in self._batched(cut, partial(_look_around, points, cut, sent, around)):
                     pass
             moved: Floats = spread_among(points, around, limit).cpu().numpy()
         return moved
 
     def _sent(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float]
-    ) -> tuple[torch.Tensor, _Held]:
-        with current(self.device), enough_memory(self.device, len(here)):
-            return torch.from_numpy(here).to(self.device), _Held.of(cut, scales, probed, self.device)
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float]
+    ) -> tuple[torch.Tensor, _DeviceCut]:
+        with current(self.device), enough_memory(self.device, len(positions)):
+            return torch.from_numpy(positions).to(self.device), _DeviceCut.of(cut, scales, known_distances, self.device)
 
     def _batched(self, cut: Patches, call: Callable[[slice], _T]) -> Iterator[_T]:
         """Call with batch after batch of a cut's patches, with halves where memory runs out."""
@@ -211,22 +211,22 @@ class OnDevice:
         yield from self._pool.map(finish, batch, owned)
 
     @torch.inference_mode()
-    def _launch(self, points: torch.Tensor, cut: Patches, held: _Held, chosen: range) -> torch.Tensor:
+    def _launch(self, points: torch.Tensor, cut: Patches, sent: _DeviceCut, chosen: range) -> torch.Tensor:
         # A last batch that is not full is filled up with its last patch: one shape more would be one graph more.
         full = self.batch if len(cut.seeds) > self.batch else len(chosen)
         batch = torch.arange(chosen.start, chosen.start + full, device=self.device).clamp(max=chosen.stop - 1)
         some = slice(chosen.start, chosen.stop)
-        distance = held.probed[batch] if held.known[some].all() else None
+        distance = sent.known_distances[batch] if sent.known[some].all() else None
         rows = max(1, int(cut.owned[some].max()))
-        return self._graphs(held.cut_out(points, batch), held.owned[batch], distance, rows)
+        return self._graphs(sent.cut_out(points, batch), sent.owned[batch], distance, rows)
 
 
 @dataclass(frozen=True)
-class _Held:
+class _DeviceCut:
     """A cut and what goes with it, on the device: sent up once, for every batch of it.
 
-    known: (M,), of which patches `probed`, (M, 1), holds what the DistanceModule said, on the host; index: (M, P),
-    seeds, owned: (M,), as in Patches; scales: (M,).
+    known: (M,), on the host, of which patches `known_distances`, (M, 1), holds what the DistanceModule said; index:
+    (M, P), seeds, owned: (M,), as in Patches; scales: (M,).
     """
 
     known: npt.NDArray[np.bool_]
@@ -234,11 +234,11 @@ class _Held:
     seeds: torch.Tensor
     owned: torch.Tensor
     scales: torch.Tensor
-    probed: torch.Tensor
+    known_distances: torch.Tensor
 
     @classmethod
-    def of(cls, cut: Patches, scales: Floats, probed: Mapping[int, float], device: torch.device) -> _Held:
-        said = np.array([[probed.get(patch, np.nan)] for patch in range(len(cut.seeds))], dtype=np.float32)
+    def of(cls, cut: Patches, scales: Floats, known_distances: Mapping[int, float], device: torch.device) -> _DeviceCut:
+        said = np.array([[known_distances.get(patch, np.nan)] for patch in range(len(cut.seeds))], dtype=np.float32)
         parts = (torch.from_numpy(part).to(device) for part in (cut.index, cut.seeds, cut.owned, scales, said))
         return cls(~np.isnan(said[:, 0]), *parts)
 
@@ -247,9 +247,9 @@ class _Held:
         return cut_out(points, self.index[batch], self.seeds[batch], self.scales[batch])
 
 
-def _look_around(points: torch.Tensor, cut: Patches, held: _Held, around: torch.Tensor, batch: slice) -> None:
+def _look_around(points: torch.Tensor, cut: Patches, sent: _DeviceCut, around: torch.Tensor, batch: slice) -> None:
     """Write the rows of the points nearest to each that some patches own into around (N, k), nearest first."""
-    x, index, owned = held.cut_out(points, batch), held.index[batch], held.owned[batch]
+    x, index, owned = sent.cut_out(points, batch), sent.index[batch], sent.owned[batch]
     rows = max(1, int(cut.owned[batch].max()))
     patch, row = (torch.arange(rows, device=points.device) < owned[:, None]).nonzero(as_tuple=True)
     found = knn(x, around.shape[1], rows)[patch, row].long()  # (n, k), in any order

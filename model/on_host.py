@@ -29,38 +29,38 @@ class OnHost:
         self._pool = ThreadPoolExecutor(threads, initializer=_one_thread)
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Evaluate few patches ahead, so that a slow reader does not fill the memory."""
-        points = torch.from_numpy(here)
+        points = torch.from_numpy(positions)
 
         def move(patch: int) -> _T:
-            known = probed.get(patch)
+            known = known_distances.get(patch)
             distance = None if known is None else torch.tensor([[known]])
             owned = int(cut.owned[patch])
             x = _cut_out(points, cut, scales, patch)
             moved = self._forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned]
             return finish(patch, moved.double().numpy())
 
-        yield from self.each(move, range(len(cut.seeds)))
+        yield from self.mapper(move, range(len(cut.seeds)))
 
-    def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
+    def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
-        points = torch.from_numpy(here)
+        points = torch.from_numpy(positions)
 
         def read(patch: int) -> float:
             return float(self._distances(_cut_out(points, cut, scales, patch)))
 
-        return np.array(list(self.each(read, range(len(cut.seeds)))))
+        return np.array(list(self.mapper(read, range(len(cut.seeds)))))
 
-    def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
         """Spread tile by tile, the halo around."""
-        moved = np.empty_like(here)
+        moved = np.empty_like(positions)
         for rows, own in tiling.surroundings():
-            moved[rows[:own]] = spread(here[rows], limit, workers=self._threads, each=self.each)[:own]
+            moved[rows[:own]] = spread(positions[rows], limit, workers=self._threads, mapper=self.mapper)[:own]
         return moved
 
-    def each(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
+    def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
         """Map in order, few results waiting."""
         waiting: deque[Future[_T]] = deque()
         try:

@@ -16,18 +16,18 @@ __all__ = ["FAR_OUT", "far_out", "isolated"]
 # others in one place.
 FAR_OUT = 1e12
 
-_AROUND = 8  # neighbours: what lies in a group of more belongs to something
+_NEIGHBOURS = 8  # what lies in a group of more belongs to something
 # How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
 # with 3 % of Gaussian noise none is beyond the first pair; the second is for what is near the surface, once the far is
 # gone. Laplace noise has a few beyond the first: so few are noise, but for those that make the bounding sphere larger.
-_DENSE = 0.9
-_FAR, _FARTHER_THAN_NEIGHBOURS = 4.5, 5.0
-_NEAR, _NEARER_THAN_NEIGHBOURS, _ROUNDS = 2.0, 2.5, 3
-_NOTICED, _ALONE = 0.001, 20.0  # of the points; where fewer are far, they have to be so far
-_MOST = 0.1  # of the points; where more seem to belong to nothing, the cloud is of another kind
+_DENSE_QUANTILE = 0.9
+_FAR_RATIO, _FAR_NEIGHBOUR_RATIO = 4.5, 5.0
+_NEXT_RATIO, _NEXT_NEIGHBOUR_RATIO, _ROUNDS = 2.0, 2.5, 3
+_FEW_SHARE, _ALONE_RATIO = 0.001, 20.0  # of the points; where fewer are far, they have to be so far
+_MOST_SHARE = 0.1  # of the points; where more seem to belong to nothing, the cloud is of another kind
 # What is sparse beside the rest may be a surface all the same: its points are as far apart as their neighbours
 # are, and lie in a sheet or a line with them (their least std beside the next; of points in a volume 0.6).
-_SHEET, _FLAT, _MOSTLY, _EVEN = 16, 0.35, 0.5, 2.0
+_SHEET_NEIGHBOURS, _SHEET_FLATNESS, _SHEET_SHARE, _SHEET_NEIGHBOUR_RATIO = 16, 0.35, 0.5, 2.0
 _PROBES = 48
 _BLOCK = 2**16  # points whose neighbours are held at once
 
@@ -48,25 +48,25 @@ def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[np.bool_]:
     """Say of each point of an object (N, 3) whether it lies apart from all others: (N,).
 
-    None does in a scene, whose far parts are sparse, and where more than _MOST would. Where some do, everyone's patches
-    have a few, which read as noise that the whole cloud has.
+    None does in a scene, whose far parts are sparse, and where more than _MOST_SHARE would. Where some do, everyone's
+    patches have a few, which read as noise that the whole cloud has.
     """
     beside_most, beside_neighbours = _distances(xyz, workers)
-    apart = (beside_most > _FAR) | (beside_neighbours > _FARTHER_THAN_NEIGHBOURS)
-    sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _EVEN), workers)
+    apart = (beside_most > _FAR_RATIO) | (beside_neighbours > _FAR_NEIGHBOUR_RATIO)
+    sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _SHEET_NEIGHBOUR_RATIO), workers)
     apart &= ~sheet
-    few = apart.mean() < _NOTICED
+    few = apart.mean() < _FEW_SHARE
     if few:
-        apart = (beside_most > _ALONE) & ~sheet
+        apart = (beside_most > _ALONE_RATIO) & ~sheet
     if not apart.any():
         return apart
-    if apart.mean() > _MOST or _is_scene(xyz[~apart]):
+    if apart.mean() > _MOST_SHARE or _is_scene(xyz[~apart]):
         return np.zeros_like(apart)
     for _ in range(0 if few else _ROUNDS):
         rows = np.flatnonzero(~apart)
         beside_most, beside_neighbours = _distances(xyz[rows], workers)
-        found = ((beside_most > _NEAR) | (beside_neighbours > _NEARER_THAN_NEIGHBOURS)) & ~sheet[rows]
-        if not found.any() or apart.sum() + found.sum() > _MOST * len(xyz):
+        found = ((beside_most > _NEXT_RATIO) | (beside_neighbours > _NEXT_NEIGHBOUR_RATIO)) & ~sheet[rows]
+        if not found.any() or apart.sum() + found.sum() > _MOST_SHARE * len(xyz):
             break
         apart[rows[found]] = True
     return apart
@@ -74,7 +74,7 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
 
 def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return how far each point's 8th neighbour is, beside most points and beside its own neighbours: (N,) each."""
-    count = min(_AROUND, len(xyz) - 1)
+    count = min(_NEIGHBOURS, len(xyz) - 1)
     tree, reach = cKDTree(xyz), np.empty(len(xyz))
     around = np.empty((len(xyz), count), dtype=np.int32)
     for start in range(0, len(xyz), _BLOCK):
@@ -85,7 +85,7 @@ def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[
     for start in range(0, len(xyz), _BLOCK):
         some = slice(start, start + _BLOCK)
         of_neighbours[some] = np.median(reach[around[some]], axis=1)
-    return reach / max(np.quantile(reach, _DENSE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
+    return reach / max(np.quantile(reach, _DENSE_QUANTILE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
 
 
 def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], workers: int) -> npt.NDArray[np.bool_]:
@@ -97,16 +97,16 @@ def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], work
     if not asked.any():  # as of nearly every cloud: spare it another tree
         return flat
     rows, tree = np.flatnonzero(asked), cKDTree(xyz)
-    around = np.empty((len(rows), min(_SHEET, len(xyz))), dtype=np.int32)
+    around = np.empty((len(rows), min(_SHEET_NEIGHBOURS, len(xyz))), dtype=np.int32)
     for start in range(0, len(rows), _BLOCK):
         some = slice(start, start + _BLOCK)
         around[some] = tree.query(xyz[rows[some]], k=np.arange(1, around.shape[1] + 1), workers=workers)[1]
         near = xyz[around[some]]
         near -= near.mean(axis=1, keepdims=True)
         least, following, _ = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near).T
-        flat[rows[some]] = least < _FLAT**2 * following
+        flat[rows[some]] = least < _SHEET_FLATNESS**2 * following
     sheet = np.zeros(len(xyz), dtype=bool)
-    sheet[rows] = flat[around].mean(axis=1) > _MOSTLY
+    sheet[rows] = flat[around].mean(axis=1) > _SHEET_SHARE
     return sheet
 
 

@@ -12,7 +12,7 @@ import torch
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["Each", "Finish", "Floats", "Forward", "Processor", "cut_out"]
+__all__ = ["Finish", "Floats", "Forward", "Mapper", "Processor", "cut_out"]
 
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
@@ -22,7 +22,7 @@ Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch
 Finish = Callable[[int, Floats], _T]  # a patch's number and how far its points move -> what is made of it
 
 
-class Each(Protocol):
+class Mapper(Protocol):
     """What calls a function with each of some items: `map`, or that on threads."""
 
     def __call__(self, function: Callable[[_Item], _T], items: Iterable[_Item], /) -> Iterable[_T]:
@@ -30,25 +30,25 @@ class Each(Protocol):
 
 
 class Processor(Protocol):
-    """Where patches are evaluated. here: (N, 3) positions in the unit ball; scales: (M,), one for each patch of cut."""
+    """Where patches are evaluated. positions: (N, 3), in the unit ball; scales: (M,), one for each patch of cut."""
 
     def displacements(
-        self, here: Floats, cut: Patches, scales: Floats, probed: Mapping[int, float], finish: Finish[_T]
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
     ) -> Iterator[_T]:
         """Yield patch after patch what `finish` returns of its number and of how far its points move, in its own scale.
 
-        The points that it owns, (owned, 3). probed: what the DistanceModule said of patches before, by number. finish
-        is called on threads, in any order.
+        The points that it owns, (owned, 3). known_distances: what the DistanceModule said of patches before, by number.
+        finish is called on threads, in any order.
         """
 
-    def distances(self, here: Floats, cut: Patches, scales: Floats) -> Floats:
+    def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
 
     @property
-    def each(self) -> Each:
+    def mapper(self) -> Mapper:
         """Calls on threads of the CPU."""
 
-    def spread(self, here: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
         """Return what `model.spread.spread` does; tiling: of the pass before."""
 
 

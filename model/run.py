@@ -15,8 +15,8 @@ from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, far_out, isolated
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import made_of, reaches
-from straightpcf.model.spacing import Lie
+from straightpcf.model.restraint import restrained_step, trusted_noise_stds
+from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import InvalidCloud, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
@@ -30,7 +30,7 @@ MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patc
 # Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/filter.md, "Few points").
 _FEW_POINTS = 500
 _FEWEST_APART = 100  # points among which one may lie apart
-_EVENED = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
+_SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Run:
             self._take()
         self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
-        self.held = np.zeros(len(self.moved), dtype=bool)
+        self.held_back = np.zeros(len(self.moved), dtype=bool)
         self.readings: list[Reading] = []  # before each pass, and after the last
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
@@ -117,19 +117,19 @@ class Run:
         tiles = split(self.points.xyz, self.filter.tile_points)
         tiling: Tiling | None = None
         while True:
-            here = self.frame.enter(self.points.xyz)
-            here += self.moved
-            evened = self._evened(here, tiling, planned)
-            here += evened
-            tiling = self._tiling(here, tiles)
-            self.readings.append(self.reader.read(here, tiling, self.readings[0] if self.readings else None))
+            positions = self.frame.enter(self.points.xyz)
+            positions += self.moved
+            spread_step = self._spread_step(positions, tiling, planned)
+            positions += spread_step
+            tiling = self._tiling(positions, tiles)
+            self.readings.append(self.reader.read(positions, tiling, self.readings[0] if self.readings else None))
             left = self._passes_left(planned)
             if left == 0:
                 self.noise_after = self._noise_left(tiles)
                 return
             self.iterations += 1
-            self.moved += evened
-            yield from self._pass(here, tiling, left)
+            self.moved += spread_step
+            yield from self._pass(positions, tiling, left)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -143,8 +143,8 @@ class Run:
             warnings.append(f"{self.far_out_count} points are {farther} and were passed through")
         if self.apart_count:
             warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
-        if held := np.count_nonzero(self.held[self.points.inverse]):
-            warnings.append(f"{held} points are on walls closer together than points are, and were held back")
+        if held_back := np.count_nonzero(self.held_back[self.points.inverse]):
+            warnings.append(f"{held_back} points are on walls closer together than points are, and were held back")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
         elif len(self.points.xyz) < MIN_POINTS:
@@ -161,8 +161,8 @@ class Run:
         first, strength = self.readings[0], self.options.strength
         if strength in (0.0, 1.0):
             return (self.readings[-1] if strength else first).noise_std
-        here = self.frame.enter(self.points.xyz) + strength * self.moved
-        return self.reader.read(here, self._tiling(here, tiles), first).noise_std
+        positions = self.frame.enter(self.points.xyz) + strength * self.moved
+        return self.reader.read(positions, self._tiling(positions, tiles), first).noise_std
 
     @property
     def distances(self) -> tuple[float, ...]:
@@ -176,33 +176,34 @@ class Run:
             return 1 - self.iterations
         return self.filter.calibration.passes_left(self.distances, self.readings[0].noise_in_radii)
 
-    def _evened(
-        self, here: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
+    def _spread_step(
+        self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
     ) -> npt.NDArray[np.float64] | float:
         """Return how points go along the surface before the pass that comes, (N, 3); tiling: the last pass's.
 
         Not before the first, nor where chance laid them, or a scanner: scan lines are no clumps. d is read of the
         points so spread, also where no pass comes after.
         """
-        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].lie.scattered:
+        if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].sampling.irregular:
             return 0.0
-        return self.filter.processor.spread(here, tiling, _EVENED * self.readings[0].noise_std)
+        return self.filter.processor.spread(positions, tiling, _SPREAD_LIMIT * self.readings[0].noise_std)
 
-    def _pass(self, here: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
+    def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all
-        shown = self.readings[-1]
-        settled, whole = 0, len(shown.parts) * len(here)
-        steps = [np.zeros_like(here) for _ in shown.parts[1:]]  # all but the last, which is settled as it comes
-        # The patches are cut from `here`, so results may be written into self.moved as they come.
-        for number, cut in self._cuts(here, tiling, shown.parts):
-            scales = patch_scales(cut.radii, scene=shown.scene, zoom=self.reader.zooms(here, cut, shown))
-            probed, believed = shown.probed, None
-            if shown.scene and self.filter.zoom:
-                probed, believed = self._believed(here, cut, scales)
-            made = partial(self._made, here, cut, scales, shown.lie, believed)
-            for owned, step, held in self.filter.processor.displacements(here, cut, scales, probed, made):
-                self.held[owned] |= held
-                settled += len(owned)
+        reading = self.readings[-1]
+        points_done, whole = 0, len(reading.parts) * len(positions)
+        steps = [np.zeros_like(positions) for _ in reading.parts[1:]]  # all but the last, which is settled as it comes
+        # The patches are cut from `positions`, so results may be written into self.moved as they come.
+        for number, cut in self._cuts(positions, tiling, reading.parts):
+            scales = patch_scales(cut.radii, scene=reading.scene, zoom=self.reader.zooms(positions, cut, reading))
+            known, trusted_noise = reading.known_distances, None
+            if reading.scene and self.filter.zoom:
+                known, trusted_noise = self._trusted_noise(positions, cut, scales)
+            finish = partial(self._restrained_step, positions, cut, scales, reading.sampling, trusted_noise)
+            steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish)
+            for owned, step, held_back in steps_made:
+                self.held_back[owned] |= held_back
+                points_done += len(owned)
                 if number < len(steps):
                     steps[number][owned], owned = step, owned[:0]
                 else:
@@ -211,16 +212,16 @@ class Run:
                 indices = self.rows[copies]
                 moved = self.moved[self.points.inverse[copies]]
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
-                self._progress = begun_at + settled / whole * share
+                self._progress = begun_at + points_done / whole * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, self._progress)
 
-    def _made(
+    def _restrained_step(
         self,
-        here: npt.NDArray[np.float64],
+        positions: npt.NDArray[np.float64],
         cut: Patches,
         scales: npt.NDArray[np.float64],
-        lie: Lie,
-        believed: npt.NDArray[np.float64] | None,
+        sampling: Sampling,
+        trusted_noise: npt.NDArray[np.float64] | None,
         patch: int,
         displacement: npt.NDArray[np.float64],
     ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], bool]:
@@ -228,27 +229,29 @@ class Run:
         owned, step = cut.owned_points(patch), displacement / scales[patch]
         if not self.filter.zoom:
             return owned, step, False
-        limit = None if believed is None else believed[patch]
-        return owned, *made_of(step, self.moved[owned], here[cut.index[patch]], lie=lie, believed=limit)
+        limit = None if trusted_noise is None else trusted_noise[patch]
+        moved, around = self.moved[owned], positions[cut.index[patch]]
+        return owned, *restrained_step(step, moved, around, sampling=sampling, trusted_noise=limit)
 
-    def _believed(
-        self, here: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]
+    def _trusted_noise(
+        self, positions: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]
     ) -> tuple[dict[int, float], npt.NDArray[np.float64]]:
         """Return what the DistanceModule says of a scene's patches, by number, and the noise std believed of each."""
-        distances = self.filter.processor.distances(here, cut, scales)
+        distances = self.filter.processor.distances(positions, cut, scales)
         noise = self.reader.noise_stds(distances, scales)
-        return dict(enumerate(distances.tolist())), reaches(here, cut, noise, self.readings[0].usual)
+        trusted = trusted_noise_stds(positions, cut, noise, self.readings[0].noise_of_most)
+        return dict(enumerate(distances.tolist())), trusted
 
     def _cuts(
-        self, here: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]
+        self, positions: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]
     ) -> Iterator[tuple[int, Patches]]:
         """Cut a pass once for each of some numbers of parts: the whole cloud, or part after part."""
         for number, count in enumerate(parts):
             if count == 1:
                 yield from ((number, cut) for cut in tiling.cuts())
                 continue
-            for rows in tiling.parted(count):
-                yield from ((number, cut.of_rows(rows)) for cut in self._tiling(here[rows]).cuts())
+            for rows in tiling.subsamples(count):
+                yield from ((number, cut.of_rows(rows)) for cut in self._tiling(positions[rows]).cuts())
 
     def _tiling(self, xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]] | None = None) -> Tiling:
         owner = self.filter

@@ -1,4 +1,4 @@
-"""How a cloud's points lie on their surface: evenly, or as chance or a scanner has it, and how near it."""
+"""How a surface was sampled: evenly, or as chance or a scanner has it, and how near to it its points lie."""
 
 from __future__ import annotations
 
@@ -9,55 +9,55 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.low_noise import low_noise_weight, noise_in_neighbourhoods
 from straightpcf.model.neighbourhoods import Nearest, inner_points
 from straightpcf.model.patches import Patches
-from straightpcf.model.processor import Each, Floats
-from straightpcf.model.quiet import noise_in_neighbourhoods, quietness
+from straightpcf.model.processor import Floats, Mapper
 from straightpcf.model.walls import between_walls, has_walls
 
-__all__ = ["Lie"]
+__all__ = ["Sampling"]
 
 # The ratio of the areas that a point's nearest 8 and nearest 32 others take varies, as a logarithm, with a std of
 # 0.3 where points fall by chance (a beta distribution's 0.32, less what counting leaves out), and of 0.12 to 0.17 where
 # they were spread evenly. Noise brings the two together: at 0.6 of the spacing to 0.27 and 0.23 (docs/training-log.md).
-_FEW, _MANY = 8, 32
-_SCATTERED, _TELLING = 0.25, 0.6
+_FEW_NEIGHBOURS, _MANY_NEIGHBOURS = 8, 32
+_IRREGULAR_STD, _TELLING_NOISE = 0.25, 0.6
 # The nearest other's area beside a 32nd of that of 32: 1.4 to 2 where points are even, 0.5 to 1 in lines, in grids of
 # cells of 1 : 2.5 and more, and by chance.
-_LINED = 1.3
-_LEAST = 100  # points of a patch; of fewer a third have the nearest 32 in common
-_NEAREST = 64  # what the looks ask for
+_LINES_AREA_RATIO = 1.3
+_LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
+_NEIGHBOURS_LOOKED_UP = 64  # what the statistics ask for
 _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, at most, and of all where they are few
 
 
 @dataclass(frozen=True)
-class Lie:
+class Sampling:
     """How points lie before the first pass.
 
-    scattered: on their surface by chance, or in lines, as a scene's do; quiet: how little noise an object's have beside
-    the distances between them, 0 to 1; walls: whether they may be on walls closer together than these.
+    irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
+    beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these.
     """
 
-    scattered: bool = False
-    quiet: float = 0.0
-    walls: bool = False
+    irregular: bool = False
+    low_noise: float = 0.0
+    thin_walls: bool = False
 
     @classmethod
-    def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, each: Each = map) -> Lie:
+    def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, mapper: Mapper = map) -> Sampling:
         """Look at an object's points (N, 3), with noise of some std, in some of its patches.
 
-        each: calls a function with the patches' rows, on threads if it has some.
+        mapper: calls a function with the patches' rows, on threads if it has some.
         """
         samples = max(_SAMPLES, _SAMPLES_OF_ALL // len(patches.index))
-        size, look = patches.index.shape[1], partial(_Look.at, xyz, samples, len(patches.index) == 1)
-        looks = list(each(look, patches.index))
-        scattered = size >= _LEAST and _is_scattered(np.concatenate([look.areas for look in looks]), noise_std)
-        walls = has_walls([look.between_walls for look in looks])
-        return cls(scattered, quietness([look.noise for look in looks]), walls)
+        size, measure = patches.index.shape[1], partial(_PatchStatistics.at, xyz, samples, len(patches.index) == 1)
+        found = list(mapper(measure, patches.index))
+        irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(np.concatenate([s.areas for s in found]), noise_std)
+        thin_walls = has_walls([s.between_walls for s in found])
+        return cls(irregular, low_noise_weight([s.noise for s in found]), thin_walls)
 
 
 @dataclass(frozen=True)
-class _Look:
+class _PatchStatistics:
     """What n points of a patch have around them.
 
     areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; noise, between_walls: as of
@@ -69,22 +69,22 @@ class _Look:
     between_walls: list[bool]
 
     @classmethod
-    def at(cls, xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> _Look:
+    def at(cls, xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> _PatchStatistics:
         points = xyz[rows]
         inner = inner_points(points, whole=whole)
-        near = Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEAREST)
+        near = Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP)
         last = near.distances.shape[1] - 1
-        areas = np.square(near.distances[:, [1, min(_FEW, last), min(_MANY, last)]])
+        areas = np.square(near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]])
         return cls(areas, noise_in_neighbourhoods(near), between_walls(near))
 
 
-def _is_scattered(areas: Floats, noise_std: float) -> bool:
-    """Say whether points with noise of some std lie by chance, or in lines; areas: (n, 3), as of `_Look`.
+def _is_irregular(areas: Floats, noise_std: float) -> bool:
+    """Say whether points with noise of some std lie by chance, or in lines; areas: (n, 3), as of `_PatchStatistics`.
 
     Where noise is as large as the distance between points nothing tells, and they are taken for even.
     """
     nearest, few, many = np.maximum(areas.T, 1e-300)
-    if noise_std >= _TELLING * np.sqrt(np.pi / _MANY * np.median(many)):
+    if noise_std >= _TELLING_NOISE * np.sqrt(np.pi / _MANY_NEIGHBOURS * np.median(many)):
         return False
     low, high = np.quantile(np.log(few / many), (0.16, 0.84))
-    return bool(high - low > 2 * _SCATTERED or _MANY * np.median(nearest / many) < _LINED)
+    return bool(high - low > 2 * _IRREGULAR_STD or _MANY_NEIGHBOURS * np.median(nearest / many) < _LINES_AREA_RATIO)

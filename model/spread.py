@@ -9,41 +9,41 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from straightpcf.model.processor import Each, Floats
+from straightpcf.model.processor import Floats, Mapper
 
-__all__ = ["AROUND", "spread", "spread_among"]
+__all__ = ["TANGENT_NEIGHBOURS", "spread", "spread_among"]
 
-AROUND = 16  # neighbours of which the tangent plane is taken
+TANGENT_NEIGHBOURS = 16  # of which the tangent plane is taken
 _ROUNDS = 2
-_STEP = 0.2
-_PUSHING = 8  # neighbours
+_PUSH_SHARE = 0.2  # of the mean distance to these, what a round moves by
+_PUSHING_NEIGHBOURS = 8
 # The length of the mean direction to a point's neighbours: 0 where they are all around, 0.64 on a straight border.
 _BORDER, _INSIDE = 0.5, 0.3
 _CHUNKS = {"cpu": 1 << 12, "cuda": 1 << 15}  # points at once: what the cache holds, what a batched product takes
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def spread(xyz: Floats, limit: float, *, workers: int = 1, each: Each = map) -> Floats:
+def spread(xyz: Floats, limit: float, *, workers: int = 1, mapper: Mapper = map) -> Floats:
     """Return how far each of the points (N, 3) goes to be farther from its nearest ones: (N, 3), along the surface.
 
     Noise moves points along a surface as far as across it, and leaves them in clumps and gaps that no clean cloud has;
     where each came from cannot be known, but that they were apart can. A weighted repulsion in the tangent plane, as in
     LOP (Lipman et al. 2007, "Parameterization-free projection for geometry reconstruction"). limit: the farthest that
     any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay. workers: threads that
-    look up neighbours; each: calls a function with chunks of the points, in any order, on threads if it has some.
+    look up neighbours; mapper: calls a function with chunks of the points, in any order, on threads if it has some.
     """
-    _, index = cKDTree(xyz).query(xyz, k=min(AROUND, len(xyz) - 1) + 1, workers=workers)
+    _, index = cKDTree(xyz).query(xyz, k=min(TANGENT_NEIGHBOURS, len(xyz) - 1) + 1, workers=workers)
     around = torch.from_numpy(index[:, 1:].astype(np.int32))
-    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit, each=each).numpy()
+    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit, mapper=mapper).numpy()
     return moved
 
 
-def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, each: Each = map) -> torch.Tensor:
+def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, mapper: Mapper = map) -> torch.Tensor:
     """Do what `spread` does for points (N, 3) float64 on any device.
 
     around: (N, k) rows of each point's nearest others, nearest first.
     """
-    pushing = around[:, :_PUSHING]
+    pushing = around[:, :_PUSHING_NEIGHBOURS]
     step = _CHUNKS[xyz.device.type]
     chunks = [slice(start, start + step) for start in range(0, len(xyz), step)]
     normal, free, moved = torch.empty_like(xyz), torch.empty_like(xyz[:, :1]), torch.empty_like(xyz)
@@ -59,7 +59,7 @@ def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, each:
         far = _length(away)
         reach = far.amax(dim=1, keepdim=True).clamp(min=_TINY)
         force = (away * (1 / far.clamp(min=_TINY) - 1 / reach)).sum(dim=1)
-        force *= _STEP * far.mean(dim=1) * free[some]
+        force *= _PUSH_SHARE * far.mean(dim=1) * free[some]
         there[some] = here[some] + force - (force * normal[some]).sum(dim=1, keepdim=True) * normal[some]
 
     def limited(here: torch.Tensor, some: slice) -> None:
@@ -68,13 +68,13 @@ def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, each:
 
     # Nothing is done with all points at once: torch would share that among OpenMP's threads, which take twenty times
     # as long where another process has one of the cores.
-    _all(each(look, chunks))
+    _all(mapper(look, chunks))
     here = xyz
     for _ in range(_ROUNDS):
         there = torch.empty_like(xyz)
-        _all(each(partial(push, here, there), chunks))
+        _all(mapper(partial(push, here, there), chunks))
         here = there
-    _all(each(partial(limited, here), chunks))
+    _all(mapper(partial(limited, here), chunks))
     return moved
 
 

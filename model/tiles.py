@@ -17,7 +17,7 @@ __all__ = ["Tiling", "split"]
 
 # A point's patch reaches at most two radii beyond it: one to the seed, one from there to the rim.
 _HALO_RADII = 2.0
-_SPARSEST = 90  # percentile of a tile's patch radii that its halo is made for
+_HALO_PERCENTILE = 90  # percentile of a tile's patch radii that its halo is made for
 _PROBES = 48  # patches that are looked at to know a cloud
 
 
@@ -72,7 +72,7 @@ class Tiling:
             return None
         return self._cut(self._xyz)
 
-    def parted(self, parts: int) -> list[npt.NDArray[np.int64]]:
+    def subsamples(self, parts: int) -> list[npt.NDArray[np.int64]]:
         """Part the pass's points into clouds of N / parts rows, ascending, each as evenly spread as the whole.
 
         Points are dealt out in the order of a k-d tree's leaves, where neighbours follow one another; tile by tile.
@@ -94,7 +94,7 @@ class Tiling:
             share = max(2, round(count * len(core) / len(self._xyz)))
             seeds = core[np.linspace(0, len(core) - 1, share).astype(np.int64)]
             patches = patches_around(cKDTree(self._xyz[core]), self._xyz[seeds], PATCH_SIZE, workers=self._workers)
-            self._margins.append(_HALO_RADII * float(np.percentile(patches.radii, _SPARSEST)))
+            self._margins.append(_HALO_RADII * float(np.percentile(patches.radii, _HALO_PERCENTILE)))
             found.append(patches.of_rows(core))
         return Patches.joined(found), range(0)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.neighbourhoods import INNER, Nearest, Neighbourhoods
+from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods
 
 __all__ = ["between_walls", "has_walls", "share_between_walls"]
 
@@ -20,16 +20,18 @@ Floats = npt.NDArray[np.float64]
 
 # Of 24 the plane lies along walls that are up to 1.2 times as far apart as points, of 64 up to twice as far. So many
 # reach where walls bend, and have a quadric instead; of 100 it lies along walls where of 64 it may lie between them.
-_AROUND = (24, 64, 100)
-_BENT = 64
+_NEIGHBOUR_COUNTS = (24, 64, 100)
+_QUADRIC_FROM = 64
 # The share of neighbours nearer to their plane than half of their std: 0.31 and more of one surface with noise,
 # 0.29 where that is uniform along one axis, 0.02 to 0.28 of walls. A sharp rim with noise has few, too, in some of a
 # cloud's patches, so it has walls where that is so of a fifth of them.
-_MIDWAY, _FEW, _MAY_BE_FEW, _SOME = 0.5, 0.27, 0.28, 0.2
-_THICK = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
+_MIDWAY_STDS = 0.5
+_WALLS_MIDWAY_SHARE, _MAYBE_WALLS_MIDWAY_SHARE = 0.27, 0.28
+_WALL_PATCHES_SHARE = 0.2
+_THICK_RATIO = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
 # Moves across, in stds of the points about the wall that each is on: up to the first all is made of them, from the
 # second on nothing. What the network tells apart it moves by 0.4 to 1.0 of that, what it joins or blurs by 1.2 to 1.8.
-_WHOLE, _NONE = 1.1, 1.3
+_FULL_STEP_STDS, _NO_STEP_STDS = 1.1, 1.3
 _SAMPLES = 128  # points of a patch that are looked at
 
 
@@ -50,14 +52,14 @@ class _Heights:
     @classmethod
     def of(cls, near: Neighbourhoods) -> _Heights:
         """Look at the neighbourhoods of n points."""
-        shape = _Shape.of(near)
-        height = shape.left_of(near.along_axes()[:, :, 0])
+        fit = _LocalFit.of(near)
+        height = fit.residuals(near.along_axes()[:, :, 0])
         stds = np.sqrt(np.square(height).mean(axis=1))
-        thick = stds > _THICK * near.radii
+        thick = stds > _THICK_RATIO * near.radii
         if not thick.any():
             return cls(thick, 1.0, 0.0, near.normals)
-        midway = float(np.mean(np.abs(height[thick]) < _MIDWAY * stds[thick, None]))
-        return cls(thick, midway, float(np.median(shape.noise_about_walls(height)[thick])), near.normals)
+        midway = float(np.mean(np.abs(height[thick]) < _MIDWAY_STDS * stds[thick, None]))
+        return cls(thick, midway, float(np.median(fit.noise_about_walls(height)[thick])), near.normals)
 
     def are_walls(self, few: float) -> bool:
         return self.midway < few and bool(self.thick.mean() > 0.5)
@@ -65,15 +67,15 @@ class _Heights:
     def share_left(self, step: Floats) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together."""
         thick = self.thick[: len(step)]
-        if not self.are_walls(_FEW) or not thick.any():
+        if not self.are_walls(_WALLS_MIDWAY_SHARE) or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
         beside_noise = np.sqrt(np.square(rise).mean()) / max(self.noise, 1e-300)
-        return float(np.clip((_NONE - beside_noise) / (_NONE - _WHOLE), 0.0, 1.0))
+        return float(np.clip((_NO_STEP_STDS - beside_noise) / (_NO_STEP_STDS - _FULL_STEP_STDS), 0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class _Shape:
+class _LocalFit:
     """Planes or quadrics over the neighbourhoods of n points, for least squares.
 
     terms: (n, k, m), those of each neighbour; inverse: (n, m, m), of the normal equations.
@@ -83,17 +85,17 @@ class _Shape:
     inverse: Floats
 
     @classmethod
-    def of(cls, near: Neighbourhoods) -> _Shape:
+    def of(cls, near: Neighbourhoods) -> _LocalFit:
         """Take quadrics where there are as many neighbours as _BENT."""
         _, u, v = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
         terms = [np.ones_like(u), u, v]
-        if u.shape[1] >= _BENT:
+        if u.shape[1] >= _QUADRIC_FROM:
             terms += [u * u, u * v, v * v]
         stacked = np.stack(terms, axis=2)
         equations = stacked.mT @ stacked + 1e-9 * np.eye(len(terms))  # points in a line leave some of them open
         return cls(stacked, np.linalg.inv(equations))
 
-    def left_of(self, values: Floats) -> Floats:
+    def residuals(self, values: Floats) -> Floats:
         """Return what the fits leave of values (n, k)."""
         fits = self.inverse @ (self.terms.mT @ values[:, :, None])
         left: Floats = values - (self.terms @ fits)[:, :, 0]
@@ -101,7 +103,7 @@ class _Shape:
 
     def noise_about_walls(self, height: Floats) -> Floats:
         """Return the std (n,) of heights (n, k) about two walls of the same shape, each point on its own side."""
-        side = self.left_of(np.where(height > 0, 1.0, -1.0))
+        side = self.residuals(np.where(height > 0, 1.0, -1.0))
         apart = (side * height).sum(axis=1) / np.maximum(np.square(side).sum(axis=1), 1e-300)
         _, count, terms = self.terms.shape
         left: Floats = np.square(height - apart[:, None] * side).sum(axis=1) / max(1, count - terms - 1)
@@ -110,21 +112,21 @@ class _Shape:
 
 def between_walls(near: Nearest) -> list[bool]:
     """Say whether points of a patch may be on walls close together, by their nearest 24 and 64."""
-    return [_Heights.of(near.first(count)).are_walls(_MAY_BE_FEW) for count in _AROUND[:2]]
+    return [_Heights.of(near.first(count)).are_walls(_MAYBE_WALLS_MIDWAY_SHARE) for count in _NEIGHBOUR_COUNTS[:2]]
 
 
 def has_walls(found: Sequence[Sequence[bool]]) -> bool:
     """Say whether a cloud may have walls close together; found: of its patches, or some, as of `between_walls`."""
-    return bool(np.mean(found, axis=0).max() > _SOME)
+    return bool(np.mean(found, axis=0).max() > _WALL_PATCHES_SHARE)
 
 
-def share_between_walls(step: Floats, around: Floats) -> float:
+def share_between_walls(step: Floats, patch: Floats) -> float:
     """Return the share of a step (n, 3) that leaves walls apart: 0 where it joins them, 1 where there are none.
 
-    around: (P, 3), a patch, of which the first n >= 1 points make the step.
+    patch: (P, 3) points, of which the first n >= 1 make the step.
     """
-    looked_at = np.arange(0, max(len(step), round(INNER * len(around))))
+    looked_at = np.arange(0, max(len(step), round(INNER_SHARE * len(patch))))
     looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
-    some, their_step = around[looked_at], step[looked_at[looked_at < len(step)]]
-    near = Nearest.of(some, around, max(_AROUND))
-    return min(_Heights.of(near.first(count)).share_left(their_step) for count in _AROUND)
+    some, their_step = patch[looked_at], step[looked_at[looked_at < len(step)]]
+    near = Nearest.of(some, patch, max(_NEIGHBOUR_COUNTS))
+    return min(_Heights.of(near.first(count)).share_left(their_step) for count in _NEIGHBOUR_COUNTS)

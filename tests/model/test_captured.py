@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from straightpcf.model.kernels import cuda
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.on_device import OnDevice, _Held
+from straightpcf.model.on_device import OnDevice, _DeviceCut
 from straightpcf.model.patches import Patches
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
@@ -78,8 +78,8 @@ def test_the_network_of_a_pass_can_be_captured(*, read_before: bool) -> None:
     assert moved.shape == (4, 384, 3)
 
 
-@pytest.mark.parametrize("probed", [{}, dict.fromkeys(range(40), 0.5)])
-def test_launching_a_batch_waits_for_nothing(probed: dict[int, float]) -> None:
+@pytest.mark.parametrize("known_distances", [{}, dict.fromkeys(range(40), 0.5)])
+def test_launching_a_batch_waits_for_nothing(known_distances: dict[int, float]) -> None:
     network, captured = on_device().requires_grad_(requires_grad=False), []
 
     def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
@@ -93,10 +93,11 @@ def test_launching_a_batch_waits_for_nothing(probed: dict[int, float]) -> None:
     rows, each = np.arange(40), np.ones(40)
     cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
     processor = OnDevice(forward, network.distance_module, "meta", batch=8, capture=capture)
-    points, held = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE), _Held.of(cut, each, probed, DEVICE)
+    points = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE)
+    sent = _DeviceCut.of(cut, each, known_distances, DEVICE)
     with OnCuda(), Captured():
         for first in range(0, 40, 8):
-            assert processor._launch(points, cut, held, range(first, first + 8)).shape[0] == 8
+            assert processor._launch(points, cut, sent, range(first, first + 8)).shape[0] == 8
     assert len(captured) == 2  # rows up to 128 and to 256 come twice, up to 384 once
 
 

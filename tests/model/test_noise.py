@@ -11,7 +11,7 @@ import pytest
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.noise import NoiseReader
-from straightpcf.model.normalize import LOUD_NOISE, CloudFrame
+from straightpcf.model.normalize import HIGH_NOISE, CloudFrame
 from straightpcf.model.tiles import Tiling
 from tests.clouds import torus
 
@@ -24,11 +24,11 @@ class Says:
     def __init__(self, far: float, near: float) -> None:
         self.far, self.near = far, near
 
-    def distances(self, here: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
-        noise = self.far if len(here) < _POINTS else self.near
+    def distances(self, positions: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
+        noise = self.far if len(positions) < _POINTS else self.near
         return np.minimum(noise * scales / 0.02, 1.0)  # the default calibration
 
-    def each(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    def mapper(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         return map(function, items)
 
 
@@ -37,16 +37,16 @@ def tile(xyz: npt.NDArray[np.float64]) -> Tiling:
 
 
 @pytest.mark.parametrize(
-    ("far", "near", "loud"), [(0.039, 0.039, True), (0.039, 0.032, False), (0.034, 0.039, False), (0.038, 0.035, True)]
+    ("far", "near", "high"), [(0.039, 0.039, True), (0.039, 0.032, False), (0.034, 0.039, False), (0.038, 0.035, True)]
 )
-def test_noise_is_loud_where_it_is_read_so_far_around_and_near(far: float, near: float, *, loud: bool) -> None:
+def test_noise_is_high_where_it_is_read_so_far_around_and_near(far: float, near: float, *, high: bool) -> None:
     xyz = torus(_POINTS)
-    here = CloudFrame.of(xyz).enter(xyz)
+    positions = CloudFrame.of(xyz).enter(xyz)
     reader = NoiseReader(Says(far, near), Calibration(), tile, zoom=True)  # type: ignore[arg-type]
-    reading = reader.read(here, tile(here), None)
+    reading = reader.read(positions, tile(positions), None)
     assert reading.noise_std == pytest.approx(far)
-    assert reading.loud is loud
-    assert not reading.loud or reading.noise_std > LOUD_NOISE
+    assert reading.high_noise is high
+    assert not reading.high_noise or reading.noise_std > HIGH_NOISE
 
 
 _WIDE = Calibration(noise=(0.0, 0.06))
@@ -59,8 +59,8 @@ class SaysWhere(Says):
         super().__init__(loud, quiet)
         self.limit = limit
 
-    def distances(self, here: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
-        noise = np.where(here[cut.seeds, 0] > self.limit, self.far, self.near)
+    def distances(self, positions: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
+        noise = np.where(positions[cut.seeds, 0] > self.limit, self.far, self.near)
         return np.minimum(noise * scales / _WIDE.noise[-1], 1.0)
 
 
@@ -80,16 +80,16 @@ def test_noise_is_uneven_where_patches_differ_by_more_than_shape(
     loud: float, quiet: float, limit: float, count: int, *, uneven: bool
 ) -> None:
     xyz = torus(count)
-    here = CloudFrame.of(xyz).enter(xyz)
+    positions = CloudFrame.of(xyz).enter(xyz)
     reader = NoiseReader(SaysWhere(loud, quiet, limit), _WIDE, tile, zoom=True)  # type: ignore[arg-type]
-    tiling = tile(here)
-    reading = reader.read(here, tiling, None)
+    tiling = tile(positions)
+    reading = reader.read(positions, tiling, None)
     assert reading.uneven is uneven
     (cut,) = tiling.cuts()
-    zooms = np.broadcast_to(reader.zooms(here, cut, reading), cut.seeds.shape)
-    noise = np.where(here[cut.seeds, 0] > limit, loud, quiet)
+    zooms = np.broadcast_to(reader.zooms(positions, cut, reading), cut.seeds.shape)
+    noise = np.where(positions[cut.seeds, 0] > limit, loud, quiet)
     assert (zooms <= reading.zoom).all()
     assert (zooms[noise == quiet] == reading.zoom).all()
     if uneven:
         np.testing.assert_allclose((zooms * noise)[noise == loud], min(0.03, reading.zoom * loud))
-        assert not reading.probed  # they were shown in another size
+        assert not reading.known_distances  # they were shown in another size

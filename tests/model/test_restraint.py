@@ -8,8 +8,8 @@ import pytest
 from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import across, held_to_lines, reaches, restrained
-from straightpcf.model.spacing import Lie
+from straightpcf.model.restraint import held_to_lines, limited_to_noise, trusted_noise_stds, without_tangential_motion
+from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, far_group, noisy, torus
@@ -22,17 +22,19 @@ def one_patch(count: int) -> Patches:
 
 def test_a_step_is_whole_up_to_three_noise_stds_and_none_from_four_on() -> None:
     step = np.array([[0.5, 0, 0], [0, 3.0, 0], [0, 0, 3.5], [4.0, 0, 0], [0, 9.0, 0]])
-    shares = np.linalg.norm(restrained(np.zeros((5, 3)), step, 1.0), axis=1) / np.linalg.norm(step, axis=1)
+    shares = np.linalg.norm(limited_to_noise(np.zeros((5, 3)), step, 1.0), axis=1) / np.linalg.norm(step, axis=1)
     np.testing.assert_allclose(shares, [1, 1, 0.5, 0, 0])
 
 
 def test_earlier_passes_count_and_a_step_back_is_free() -> None:
     moved = np.array([[3.0, 0, 0], [3.0, 0, 0]])
-    np.testing.assert_allclose(restrained(moved, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 1.0), [[0, 0, 0], [-1, 0, 0]])
+    np.testing.assert_allclose(
+        limited_to_noise(moved, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 1.0), [[0, 0, 0], [-1, 0, 0]]
+    )
 
 
 def test_without_noise_nothing_moves() -> None:
-    np.testing.assert_array_equal(restrained(np.zeros((2, 3)), np.array([[1e-6, 0, 0], [0, 0, 0]]), 0.0), 0.0)
+    np.testing.assert_array_equal(limited_to_noise(np.zeros((2, 3)), np.array([[1e-6, 0, 0], [0, 0, 0]]), 0.0), 0.0)
 
 
 def test_more_than_the_usual_noise_is_believed_of_a_sheet_alone() -> None:
@@ -40,18 +42,18 @@ def test_more_than_the_usual_noise_is_believed_of_a_sheet_alone() -> None:
     sheet = rng.uniform(-1, 1, (1000, 3)) * [1, 1, 0] + [0, 0, 1] * (0.1 * rng.standard_normal((1000, 1)))
     ball = rng.uniform(-1, 1, (1000, 3))
     patch = one_patch(1000)
-    assert reaches(sheet, patch, np.array([0.1]), 0.04) == 0.1
-    assert reaches(sheet, patch, np.array([0.1]), 0.02) == pytest.approx(0.06)
-    assert reaches(ball, patch, np.array([0.045]), 0.04) == 0.04
-    assert reaches(ball, patch, np.array([0.12]), 0.04) == pytest.approx(0.016)
-    assert reaches(sheet, patch, np.array([0.01]), 0.04) == 0.04
+    assert trusted_noise_stds(sheet, patch, np.array([0.1]), 0.04) == 0.1
+    assert trusted_noise_stds(sheet, patch, np.array([0.1]), 0.02) == pytest.approx(0.06)
+    assert trusted_noise_stds(ball, patch, np.array([0.045]), 0.04) == 0.04
+    assert trusted_noise_stds(ball, patch, np.array([0.12]), 0.04) == pytest.approx(0.016)
+    assert trusted_noise_stds(sheet, patch, np.array([0.01]), 0.04) == 0.04
 
 
 def test_nothing_goes_along_a_surface_and_all_across_it() -> None:
     rng = np.random.default_rng(0)
     sheet = rng.uniform(-1, 1, (500, 3)) * [1, 1, 0] + [0, 0, 1] * (0.01 * rng.standard_normal((500, 1)))
     step = rng.normal(0, 0.01, (200, 3))
-    left = across(step, sheet)
+    left = without_tangential_motion(step, sheet)
     np.testing.assert_allclose(left[:, 2], step[:, 2], atol=0.3 * 0.01)
     assert np.abs(left[:, :2]).max() < 0.3 * np.abs(step[:, :2]).max()
 
@@ -59,10 +61,12 @@ def test_nothing_goes_along_a_surface_and_all_across_it() -> None:
 def test_where_there_is_no_surface_a_step_stays_as_it_is() -> None:
     rng = np.random.default_rng(0)
     step = rng.normal(0, 0.01, (200, 3))
-    inside = np.linalg.norm(across(step, rng.standard_normal((1000, 3))), axis=1) / np.linalg.norm(step, axis=1)
+    inside = np.linalg.norm(without_tangential_motion(step, rng.standard_normal((1000, 3))), axis=1) / np.linalg.norm(
+        step, axis=1
+    )
     assert np.median(inside) == 1.0
-    np.testing.assert_array_equal(across(step, np.zeros((300, 3))), step)
-    assert across(step[:0], sheet_of(300)).shape == (0, 3)
+    np.testing.assert_array_equal(without_tangential_motion(step, np.zeros((300, 3))), step)
+    assert without_tangential_motion(step[:0], sheet_of(300)).shape == (0, 3)
 
 
 def sheet_of(count: int) -> np.ndarray:
@@ -122,4 +126,4 @@ def test_what_was_an_object_before_the_first_pass_stays_one() -> None:
     wide /= 300.0
     tiling = Tiling(wide, split(wide, 10_000), coverage=1.0, seed=0)
     assert run.reader.read(wide, tiling, None).scene
-    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False, lie=Lie())).scene
+    assert not run.reader.read(wide, tiling, Reading(0.5, 0.01, scene=False, sampling=Sampling())).scene

@@ -8,41 +8,41 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.spacing import Lie
+from straightpcf.model.spacing import Sampling
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 
-def scattered(xyz: np.ndarray, noise_std: float) -> bool:
+def irregular(xyz: np.ndarray, noise_std: float) -> bool:
     rough = noisy(xyz, noise_std)
-    return Lie.of(rough, cut_patches(rough, coverage=3.0, seed=0), noise_std).scattered
+    return Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), noise_std).irregular
 
 
 @pytest.mark.parametrize("count", [1000, 3000, 12_000])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
 def test_chance_is_told_from_evenness_while_noise_is_below_the_spacing(count: int, share: float) -> None:
     spacing = np.sqrt(4 * np.pi / count)
-    assert scattered(sphere(count), share * spacing)
-    assert not scattered(even_sphere(count), share * spacing)
+    assert irregular(sphere(count), share * spacing)
+    assert not irregular(even_sphere(count), share * spacing)
 
 
 def test_lines_are_not_even() -> None:
     turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 300, endpoint=False), np.linspace(-0.8, 0.8, 13))
     lines = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), height], axis=-1).reshape(-1, 3)
-    assert scattered(lines, 0.0)
-    assert scattered(lines, 0.01)
+    assert irregular(lines, 0.0)
+    assert irregular(lines, 0.01)
     turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 90, endpoint=False), np.linspace(-0.8, 0.8, 46))
     squares = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), height], axis=-1).reshape(-1, 3)
-    assert not scattered(squares, 0.01)
+    assert not irregular(squares, 0.01)
 
 
 def test_where_nothing_tells_points_are_taken_for_even() -> None:
-    assert not scattered(sphere(3000), 0.06)  # the spacing is 0.065
-    assert not scattered(sphere(99), 0.0)  # a third of which have the nearest 32 in common
+    assert not irregular(sphere(3000), 0.06)  # the spacing is 0.065
+    assert not irregular(sphere(99), 0.0)  # a third of which have the nearest 32 in common
 
 
 def test_as_many_points_in_one_place_are_no_error() -> None:
     xyz = np.repeat(sphere(100), 20, axis=0)
-    assert Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).scattered in (True, False)
+    assert Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).irregular in (True, False)
 
 
 @pytest.mark.parametrize(("noise_std", "at_most"), [(0.0, 5e-6), (0.002, 2.2e-5), (0.01, 4e-4)])

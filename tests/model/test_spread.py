@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.processor import Each
+from straightpcf.model.processor import Mapper
 from straightpcf.model.spread import spread
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import even_sphere, sphere
@@ -58,7 +58,7 @@ def test_points_may_come_in_any_order_and_on_any_number_of_threads() -> None:
     np.testing.assert_array_equal(spread(ball, limit=1.0, workers=2), expected)
     many = sphere(10_000, 0)  # more than are taken at once
     with ThreadPoolExecutor(3) as pool:
-        np.testing.assert_array_equal(spread(many, limit=1.0, each=pool.map), spread(many, limit=1.0))
+        np.testing.assert_array_equal(spread(many, limit=1.0, mapper=pool.map), spread(many, limit=1.0))
 
 
 @pytest.mark.parametrize("count", [2, 3, 9, 33])
@@ -71,9 +71,9 @@ def test_few_points_and_points_in_a_line_are_borne(count: int) -> None:
 def test_the_filter_spreads_between_passes_only(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
 
-    def counted(xyz: npt.NDArray[np.float64], limit: float, *, workers: int, each: Each) -> npt.NDArray[np.float64]:
+    def counted(xyz: npt.NDArray[np.float64], limit: float, *, workers: int, mapper: Mapper) -> npt.NDArray[np.float64]:
         calls.append(limit)
-        return spread(xyz, limit, workers=workers, each=each)
+        return spread(xyz, limit, workers=workers, mapper=mapper)
 
     monkeypatch.setattr("straightpcf.model.on_host.spread", counted)
     model = Filter(StraightPCF(), threads=1)

@@ -37,7 +37,7 @@ def tiling_of(xyz: npt.NDArray[np.float64], tiles: list[npt.NDArray[np.int64]]) 
 def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, equal: bool) -> None:
     xyz = np.zeros((count, 3)) if equal else torus(count)
     tiles = split(xyz, tile_points)
-    rows = tiling_of(xyz, tiles).parted(parts)
+    rows = tiling_of(xyz, tiles).subsamples(parts)
     assert np.array_equal(np.sort(np.concatenate(rows)), np.arange(count))
     assert max(map(len, rows)) - min(map(len, rows)) <= len(tiles)
     assert all((np.diff(part) > 0).all() for part in rows)
@@ -46,17 +46,17 @@ def test_every_row_is_in_one_part(count: int, tile_points: int, parts: int, *, e
 def test_a_pass_that_is_parted_again_builds_no_second_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = torus(3000)
     tiling = tiling_of(xyz, tiles := split(xyz, 1000))
-    expected = [tiling_of(xyz, tiles).parted(parts) for parts in (1, 2, 5)]
+    expected = [tiling_of(xyz, tiles).subsamples(parts) for parts in (1, 2, 5)]
     built: list[int] = []
     monkeypatch.setattr(model_tiles, "cKDTree", lambda points: built.append(len(points)) or cKDTree(points))
     for parts, rows in zip((1, 2, 5), expected, strict=True):
-        assert all(map(np.array_equal, tiling.parted(parts), rows))
+        assert all(map(np.array_equal, tiling.subsamples(parts), rows))
     assert len(built) == len(tiles)
 
 
 def test_parts_are_as_evenly_spread_as_the_whole() -> None:
     xyz = torus(12_000)
-    for part in tiling_of(xyz, split(xyz, 4000)).parted(3):
+    for part in tiling_of(xyz, split(xyz, 4000)).subsamples(3):
         alone = cKDTree(xyz[part])
         among = [len(near) for near in alone.query_ball_point(xyz[::50], 0.15)]
         of_all = [len(near) for near in cKDTree(xyz).query_ball_point(xyz[::50], 0.15)]

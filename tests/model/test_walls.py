@@ -8,7 +8,7 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.spacing import Lie
+from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
 from tests.clouds import even_sphere, noisy, sphere
 
@@ -20,20 +20,20 @@ def plate(count: int, gap: float, seed: int = 0) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), gap * sides])
 
 
-def walls(xyz: np.ndarray) -> bool:
-    return Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).walls
+def thin_walls(xyz: np.ndarray) -> bool:
+    return Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).thin_walls
 
 
 @pytest.mark.parametrize("noise_std", [0.0, 0.008])
 def test_two_walls_are_told_from_one_with_noise(noise_std: float) -> None:
-    assert walls(noisy(plate(2000, 0.04), noise_std))
-    assert not walls(noisy(plate(2000, 0.0), 0.03))
+    assert thin_walls(noisy(plate(2000, 0.04), noise_std))
+    assert not thin_walls(noisy(plate(2000, 0.0), 0.03))
     for cloud in (sphere(2000), even_sphere(8000)):
-        assert not walls(noisy(cloud, noise_std))
-        assert not walls(noisy(cloud, 0.03))
+        assert not thin_walls(noisy(cloud, noise_std))
+        assert not thin_walls(noisy(cloud, 0.03))
         ball = np.random.default_rng(0).standard_normal(cloud.shape)
         ball *= np.random.default_rng(1).random((len(cloud), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1)[:, None]
-        assert not walls(cloud + 0.04 * ball)
+        assert not thin_walls(cloud + 0.04 * ball)
 
 
 def test_a_step_that_brings_walls_together_is_told_from_one_within_them() -> None:
@@ -85,4 +85,4 @@ def test_noise_within_bent_walls_is_taken_away_where_points_are_many() -> None:
 def test_noise_that_half_of_a_sheet_has_is_not_two_walls(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sheet = np.column_stack([rng.uniform(-1, 1, (700, 2)), np.zeros(700)])
-    assert not walls(sheet + 0.06 * np.where(sheet[:, :1] > 0, rng.standard_normal(sheet.shape), 0.0))
+    assert not thin_walls(sheet + 0.06 * np.where(sheet[:, :1] > 0, rng.standard_normal(sheet.shape), 0.0))

@@ -16,67 +16,69 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods
 
-__all__ = ["noise_in_neighbourhoods", "quietness", "tempered"]
+__all__ = ["low_noise_weight", "noise_in_neighbourhoods", "wiener_weighted"]
 
 Floats = npt.NDArray[np.float64]
 
-_AROUND, _TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
+_FIT_NEIGHBOURS, _FIT_TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
 _RIDGE = 1e-9  # points in a line have a surface, too; in units of the neighbourhood's radius
 # The noise of so many points near each other is what a quarter of their surfaces leave, or less: the others have edges,
 # bends and thin parts. It is not that of the whole patch, for noise may differ from place to place.
-_SHARE, _PLACE = 0.25, 80
-# Noise beside the radius of the 16: up to the first a cloud is quiet, from the second on it is not at all.
-_QUIET, _LOUD = 0.05, 0.08
+_NOISE_QUANTILE, _NOISE_NEIGHBOURS = 0.25, 80
+# Noise beside the radius of the 16: up to the first a cloud has little, from the second on it has not at all.
+_LOW_NOISE_RATIO, _HIGH_NOISE_RATIO = 0.05, 0.08
 # A point so many times that noise from its neighbours' surface, of which the network takes off so much, is one
 # with more noise than the others.
-_OUT, _TAKEN_BACK = 6.0, 0.6
-_LEAST_OF_OTHERS = 0.1  # of a point's residual, what the fit to itself has left
+_OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
+_LEAST_LEVERAGE_LEFT = 0.1  # of a point's residual, what the fit to itself has left
 
 
 @dataclass(frozen=True)
 class _Surfaces:
     """What surfaces fitted to the neighbours of n points leave.
 
-    stds: (n,), of the neighbours; own: (n,), of the point itself, had the surface been fitted to the others only;
-    radii: (n,), of the neighbourhoods; normals: (n, 3), of length 1.
+    stds: (n,), of the neighbours; own_residuals: (n,), of the point itself, had the surface been fitted to the others
+    only; radii: (n,), of the neighbourhoods; normals: (n, 3), of length 1.
     """
 
     stds: Floats
-    own: Floats
+    own_residuals: Floats
     radii: Floats
     normals: Floats
 
 
 def noise_in_neighbourhoods(near: Nearest) -> float:
     """Return the noise of points of a patch, in radii of their neighbourhoods."""
-    here = _surfaces(near.first(_AROUND))
-    return float(np.quantile(here.stds / here.radii, _SHARE))
+    here = _surfaces(near.first(_FIT_NEIGHBOURS))
+    return float(np.quantile(here.stds / here.radii, _NOISE_QUANTILE))
 
 
-def quietness(ratios: Sequence[float]) -> float:
+def low_noise_weight(ratios: Sequence[float]) -> float:
     """Say how little noise a cloud has beside the distances of its points, 0 to 1.
 
     1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: as of `noise_in_neighbourhoods`,
     for each of some patches, of which half say.
     """
-    return float(np.clip((_LOUD - np.median(ratios)) / (_LOUD - _QUIET), 0.0, 1.0))
+    return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
 
-def tempered(step: Floats, around: Floats, quiet: float) -> Floats:
-    """Return a step (n, 3), less of it where it is more than the noise; quiet: as of `quietness`.
+def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
+    """Return a step (n, 3), less of it where it is more than the noise.
 
-    around: (P, 3), a patch, of which the first n >= 1 points make the step. Of moves m across the surface, with noise
-    n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent of the noise.
+    low_noise: as of `low_noise_weight`; patch: (P, 3) points, of which the first n >= 1 make the step. Of moves m
+    across the surface, with noise n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is
+    independent of the noise.
     """
-    points = around[: len(step)]
-    here = _surfaces(neighbourhoods(points, around, _AROUND))
+    points = patch[: len(step)]
+    here = _surfaces(neighbourhoods(points, patch, _FIT_NEIGHBOURS))
     rise = (step * here.normals).sum(axis=1)
-    _, place = cKDTree(points).query(points, k=np.arange(1, min(_PLACE, len(points)) + 1))
-    noise = np.quantile(here.stds[place], _SHARE, axis=1)
+    _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
+    noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
     moves = np.square(rise)[place].mean(axis=1)
     weight = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
-    out = (np.abs(here.own) > _OUT * noise) & (-rise * here.own > _TAKEN_BACK * here.own**2)
-    less: Floats = step * np.where(out, 1.0, 1.0 - quiet * (1.0 - weight))[:, None]
+    own = here.own_residuals
+    out = (np.abs(own) > _OUTLIER_STDS * noise) & (-rise * own > _OUTLIER_STEP_SHARE * own**2)
+    less: Floats = step * np.where(out, 1.0, 1.0 - low_noise * (1.0 - weight))[:, None]
     return less
 
 
@@ -84,10 +86,10 @@ def _surfaces(near: Neighbourhoods) -> _Surfaces:
     """Fit heights of second order over their planes to neighbourhoods."""
     height, x, y = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    products = terms.mT @ terms + _RIDGE * np.eye(_TERMS)
+    products = terms.mT @ terms + _RIDGE * np.eye(_FIT_TERMS)
     solved = np.linalg.solve(products, np.stack([np.einsum("nkp,nk->np", terms, height), terms[:, 0]], axis=-1))
     left = height - np.einsum("nkp,np->nk", terms, solved[:, :, 0])
     leverage = np.einsum("np,np->n", terms[:, 0], solved[:, :, 1])
-    own = left[:, 0] / np.maximum(1 - leverage, _LEAST_OF_OTHERS)
-    stds = np.sqrt(np.square(left).sum(axis=1) / (height.shape[1] - _TERMS))
-    return _Surfaces(stds * near.radii, own * near.radii, near.radii, near.normals)
+    own_residuals = left[:, 0] / np.maximum(1 - leverage, _LEAST_LEVERAGE_LEFT)
+    stds = np.sqrt(np.square(left).sum(axis=1) / (height.shape[1] - _FIT_TERMS))
+    return _Surfaces(stds * near.radii, own_residuals * near.radii, near.radii, near.normals)

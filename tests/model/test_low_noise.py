@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import load_filter
+from straightpcf.model.low_noise import wiener_weighted
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
-from straightpcf.model.quiet import tempered
-from straightpcf.model.spacing import Lie
+from straightpcf.model.spacing import Sampling
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 
 def quiet(xyz: np.ndarray) -> float:
-    return Lie.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).quiet
+    return Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).low_noise
 
 
 @pytest.mark.parametrize("cloud", [sphere, even_sphere])
@@ -31,7 +31,7 @@ def test_as_few_points_as_are_filtered_and_points_in_a_line_are_no_error() -> No
     for xyz in (sphere(33), line):
         step = np.full((20, 3), 0.1)
         assert 0 <= quiet(xyz) <= 1
-        assert np.isfinite(tempered(step, xyz, 1.0)).all()
+        assert np.isfinite(wiener_weighted(step, xyz, 1.0)).all()
 
 
 def test_a_step_across_is_made_smaller_by_wieners_weight() -> None:
@@ -39,12 +39,12 @@ def test_a_step_across_is_made_smaller_by_wieners_weight() -> None:
     noise, around = 0.001, np.column_stack([rng.uniform(-1, 1, (1000, 2)), 0.001 * rng.standard_normal(1000)])
     around = around[np.argsort((around**2).sum(axis=1))]
     asked = np.column_stack([np.zeros((300, 2)), 4 * noise * rng.standard_normal(300)])
-    made = tempered(asked, around, 1.0)
+    made = wiener_weighted(asked, around, 1.0)
     share = np.linalg.norm(made, axis=1) / np.linalg.norm(asked, axis=1)
     assert np.median(share) == pytest.approx(1 / 16, rel=0.5)
-    np.testing.assert_array_equal(tempered(asked, around, 0.0), asked)
+    np.testing.assert_array_equal(wiener_weighted(asked, around, 0.0), asked)
     small = np.column_stack([np.zeros((300, 2)), -0.5 * around[:300, 2]])
-    np.testing.assert_array_equal(tempered(small, around, 1.0), small)
+    np.testing.assert_array_equal(wiener_weighted(small, around, 1.0), small)
 
 
 def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
@@ -54,7 +54,7 @@ def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
     around[:300:30, 2] += 0.02
     step = np.column_stack([np.zeros((300, 2)), 0.002 * rng.standard_normal(300)])
     step[::30, 2] = -0.02
-    share = np.linalg.norm(tempered(step, around, 1.0), axis=1) / np.linalg.norm(step, axis=1)
+    share = np.linalg.norm(wiener_weighted(step, around, 1.0), axis=1) / np.linalg.norm(step, axis=1)
     assert (share[::30] == 1.0).all()
     assert np.median(share) < 0.2
 
