@@ -17,7 +17,9 @@ import straightpcf
 from straightpcf.clients import job_commands
 from straightpcf.clients.atomic import check_target, replaced_when_complete
 from straightpcf.clients.console import (
+    INTERRUPTED,
     READER_GONE,
+    asked_to_stop,
     complain,
     exit_code,
     forget_stdout,
@@ -291,11 +293,18 @@ def train(
     settled: Annotated[bool, typer.Option("--settled", help="No dropout, BatchNorm as it is: to train on.")] = False,
     minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after these, with the state saved.")] = None,
 ) -> None:
-    """Train one stage; resumable, logged as CSV."""
+    """Train one stage; resumable, logged as CSV. Ctrl-C ends it after the iteration at hand, with the state saved."""
     with needs("train"):
         from straightpcf.model.train import train as run_training
 
-    with progress_bar(f"training {stage.value}") as show:
+    done = 0
+
+    def on_step(step: Any) -> None:
+        nonlocal done
+        done = step.iteration
+        show(done / iterations, f"loss {step.loss:.3e}")
+
+    with asked_to_stop() as stop, progress_bar(f"training {stage.value}") as show:
         run_training(
             stage.value,
             data=data,
@@ -315,8 +324,12 @@ def train(
             passed=passed or (),
             settled=settled,
             minutes=minutes,
-            on_step=lambda step: show(step.iteration / step.iterations, f"loss {step.loss:.3e}"),
+            on_step=on_step,
+            stop=stop,
         )
+        if stop() and done < iterations:
+            typer.echo(f"stopped after iteration {done} of {iterations}; the same command goes on from there", err=True)
+            raise typer.Exit(INTERRUPTED)
 
 
 @app.command()

@@ -22,7 +22,9 @@ from straightpcf.points import errors
 
 __all__ = [
     "EXIT_CODES",
+    "INTERRUPTED",
     "READER_GONE",
+    "asked_to_stop",
     "complain",
     "exit_code",
     "for_each",
@@ -122,6 +124,39 @@ def interruptible() -> Iterator[None]:
 
     Another one is heeded after a while: an impatient one would keep what is done at an end from being done.
     """
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with _interruptions(interrupt):
+        yield
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Say whether an interruption, as of `interruptible`, wants work to end at its next good moment, where it asks.
+
+    Before it has asked for the first time there is nothing to save: it ends at once, as with another interruption.
+    """
+    asking = asked = False
+
+    def interrupt() -> None:
+        nonlocal asked
+        if asked or not asking:
+            raise KeyboardInterrupt
+        asked = True
+
+    def stop() -> bool:
+        nonlocal asking
+        asking = True
+        return asked
+
+    with _interruptions(interrupt):
+        yield stop
+
+
+@contextmanager
+def _interruptions(obey: Callable[[], None]) -> Iterator[None]:
     import signal
     import time
 
@@ -131,7 +166,7 @@ def interruptible() -> Iterator[None]:
         nonlocal obeyed
         if time.monotonic() - obeyed > TIDY_SECONDS:
             obeyed = time.monotonic()
-            raise KeyboardInterrupt
+            obey()
 
     ends = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # Windows has none; nohup

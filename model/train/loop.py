@@ -74,6 +74,7 @@ def train(
     settled: bool = False,
     euler_steps: int = 1,
     on_step: Callable[[TrainStep], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Path:
     """Train one stage up to `iterations`, going on from `run_dir` where a run was left there.
 
@@ -85,7 +86,8 @@ def train(
     learning rate warms up, then falls along half a cosine to 2 % at `iterations`. minutes: stop there with the state
     saved, to go on another time (a GPU may be lent for ten minutes at once). processes: on a CPU, how many share each
     batch, one thread each; batch_size must be a multiple. euler_steps: N of the pass that stage cvm trains on
-    (`coupled_loss`).
+    (`coupled_loss`). stop: asked after each iteration, whether to end there with the state saved, as an interruption
+    wants it.
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed, thread
     and process count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
     missing or unfit, DeviceUnavailable, and what `PatchSource.read` does.
@@ -106,7 +108,8 @@ def train(
     if place.type == "cuda" and place.index is not None:  # "cuda" is the current one, and set_device takes no other
         torch.cuda.set_device(place)  # captures and Triton work on the current one
 
-    resuming = state_path.exists()
+    if resuming := state_path.exists():
+        _check_run(state_path, stage, couplings)
     network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
     if distance is not None and not resuming:
         take_distance_module(network, distance)
@@ -120,20 +123,20 @@ def train(
     if stage == "cvm":
         stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
     loss_of = partial(stage_loss, network)
+    held_out = PatchSource.read(*archives, validation=True)
+    fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
+    _cut_log(run_dir / _LOG_FILE, start)
     share = batch_size // processes
     team = None
     if processes > 1:
-        team = Team(processes - 1, network, trained, stage_loss, archives, share, (seed, start), passed=passed)
+        team = Team(processes - 1, network, trained, stage_loss, archives, share, seed, start=start, passed=passed)
     step: Step = (
         GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
         if place.type == "cuda"
         else HostStep(source, loss_of, trained, optimiser, rng, share, team)
     )
-    held_out = PatchSource.read(*archives, validation=True)
-    fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
     began = time.monotonic()
     validation: float | None = None
-    _cut_log(run_dir / _LOG_FILE, start)
     with (run_dir / _LOG_FILE).open("a", newline="") as file, team or nullcontext():
         log = csv.writer(file)
         recent: list[float] = []
@@ -146,18 +149,19 @@ def train(
             if iteration % _TURN_EVERY == 0:
                 optimiser.turn_bases()
             last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
+            stopping = stop()
             # On CUDA reading the loss waits for the device: only where it is reported.
-            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last:
+            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
                 recent.append(loss.item())
                 if not math.isfinite(recent[-1]):
                     raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
                 recent_loss = recent[-1]
-            if iteration % _VALIDATE_EVERY == 0 or last:
+            if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
                 validation = _validate(stage_loss, network, average, fixed.to(place))
+            if iteration % _LOG_EVERY == 0 or last or stopping:
                 progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
                             "learning_rate": learning_rate, "validation": validation}  # fmt: skip
                 save_state(state_path, network, average, optimiser, rng, progress)
-            if iteration % _LOG_EVERY == 0 or last:
                 seconds = round(time.monotonic() - began, 1)
                 log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
                 file.flush()
@@ -165,9 +169,20 @@ def train(
             if on_step is not None:
                 on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
             validation = None
-            if last:
+            if last or stopping:
                 break
     return state_path
+
+
+def _check_run(path: Path, stage: Stage, couplings: int) -> None:
+    """Raise InvalidOptions where the state in the run's directory is of another stage or stack."""
+    network, progress = read_network(path)
+    have, count = len(network.velocity_modules), 1 if stage == "vm" else couplings
+    if progress.get("stage") != stage or have != count:
+        raise InvalidOptions(
+            f"{path} is of stage {progress.get('stage')!r} with {have} modules, not {stage!r} with {count}: "
+            "another run takes another directory"
+        )
 
 
 def _cut_log(path: Path, start: int) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Self
 
@@ -19,12 +23,14 @@ from straightpcf.model.train.passed import training_patches
 __all__ = ["NetworkLoss", "Team"]
 
 NetworkLoss = Callable[[StraightPCF, Batch], torch.Tensor]
+_LEADERS_OWN = (signal.SIGINT, signal.SIGTERM)  # sent to the group; the process that updates the weights heeds them
 
 
 class Team:
     """Processes beside the one that updates the weights, which are moved to shared memory; for a `with`.
 
-    seed: each member draws its own patches from [*seed, its number].
+    seed: each member draws its own patches from [seed, its number, the iteration], so that nothing of it need be kept
+    for a run that goes on; start: iterations that were made before.
     """
 
     def __init__(
@@ -35,27 +41,34 @@ class Team:
         loss: NetworkLoss,
         data: Sequence[Path],
         batch_size: int,
-        seed: tuple[int, ...],
+        seed: int,
         *,
+        start: int = 0,
         passed: Sequence[Path] = (),
     ) -> None:
         network.share_memory()
         self._parameters = list(trained.parameters())
         context = multiprocessing.get_context("spawn")
+        self._iteration = start
         self._members: list[tuple[Connection, torch.Tensor]] = []
+        self._processes: list[BaseProcess] = []
         for number in range(1, members + 1):
             ours, theirs = context.Pipe()
             gradient = torch.zeros(sum(p.numel() for p in self._parameters))
             gradient.share_memory_()  # type: ignore[no-untyped-call]
-            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (*seed, number), passed)
-            context.Process(target=_work, args=arguments, daemon=True).start()
+            arguments = (theirs, network, trained, loss, gradient, data, batch_size, (seed, number), passed)
+            process = context.Process(target=_work, args=arguments, daemon=True)
+            with _signals_kept():
+                process.start()
+            self._processes.append(process)
             theirs.close()
             self._members.append((ours, gradient))
 
     def start(self, *, training: bool) -> None:
         """Set every member to work on its share; do your own meanwhile."""
+        self._iteration += 1
         for pipe, _ in self._members:
-            pipe.send(training)
+            pipe.send((training, self._iteration))
 
     def join(self, loss: torch.Tensor) -> torch.Tensor:
         """Average the gradients that the parameters have with those of all members, and the loss with theirs."""
@@ -78,15 +91,32 @@ class Team:
         return loss
 
     def close(self) -> None:
-        """Let the members end; leaving a `with` of the team does so too."""
+        """End the members, who have nothing to lose; leaving a `with` of the team does so too."""
         for pipe, _ in self._members:
             pipe.close()
+        for process in self._processes:
+            process.kill()
+            process.join()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Keep signals to the group from a process that begins meanwhile, for good: it ends with its team."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # which else begins here, and lets them through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEADERS_OWN)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(
@@ -102,12 +132,16 @@ def _work(
 ) -> None:
     torch.set_num_threads(1)
     keep_large_buffers()
-    rng = np.random.default_rng(seed)
-    torch.manual_seed(int(rng.integers(2**62)))  # dropout
+    for module in trained.modules():  # BatchNorm's statistics: of two that change them, the last would win
+        for name, buffer in module.named_buffers(recurse=False):
+            setattr(module, name, buffer.clone())
     source = training_patches(data, passed, network.distance_module)
     try:
         while True:
-            trained.train(pipe.recv())
+            training, iteration = pipe.recv()
+            rng = np.random.default_rng((*seed, iteration))
+            torch.manual_seed(int(rng.integers(2**62)))  # dropout
+            trained.train(training)
             trained.zero_grad(set_to_none=True)
             loss = loss_of(network, source.draw(rng, batch_size))
             loss.backward()  # type: ignore[no-untyped-call]

@@ -184,6 +184,41 @@ def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None
     assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_an_interrupted_training_saves_what_it_has_and_says_so(processes: int, tmp_path: Path) -> None:
+    data, run = tmp_path / "shapes.npz", tmp_path / "run"
+    np.savez(data, **{f"shape{i:02d}/1000": torus(1000, i).astype(np.float32) for i in range(6)})
+    command = [sys.executable, "-c", _INTERRUPTED_TRAINING, "train", "vm", "--data", data, "--run-dir", run]
+    command += ["--batch-size", "2", "--rows", "16", "--threads", "1", "--processes", str(processes)]
+    done = subprocess.run(  # a group of its own, which the signal goes to, as a terminal's
+        command, capture_output=True, text=True, check=False, env=clean_environment(), timeout=120,
+        start_new_session=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (130, ""), done.stderr
+    assert done.stderr == "stopped after iteration 2 of 20000; the same command goes on from there\n"
+    assert (run / "log.csv").read_text().splitlines()[1].startswith("vm,2,")
+    assert (run / "state.safetensors").is_file()
+
+
+_INTERRUPTED_TRAINING = """
+import os, signal
+from straightpcf.clients.cli import main
+from straightpcf.model.train import loop
+
+def interrupted(stage, *, on_step, **wanted):
+    def step(done):
+        on_step(done)
+        if done.iteration == 1:
+            os.killpg(0, signal.SIGTERM)
+    return loop.train(stage, on_step=step, **wanted)
+
+if __name__ == "__main__":
+    import straightpcf.model.train
+    straightpcf.model.train.train = interrupted
+    main()
+"""
+
+
 @pytest.mark.parametrize(
     ("arrays", "arguments", "code", "text"),
     [

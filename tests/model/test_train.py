@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -151,6 +152,27 @@ def test_an_interrupted_run_ends_with_the_weights_of_an_uninterrupted_one(data: 
     assert same(weights(once / "state.safetensors"), weights(twice / "state.safetensors"))
 
 
+def test_a_shared_run_is_the_same_again_and_where_it_was_interrupted(data: Path, tmp_path: Path) -> None:
+    def run(name: str, stops: Sequence[bool] = ()) -> dict[str, torch.Tensor]:
+        asked = iter([*stops, *6 * [False]])
+        return weights(train("vm", data=data, run_dir=tmp_path / name, iterations=6, batch_size=2, rows=32, threads=1,
+                             processes=2, stop=lambda: next(asked)))  # fmt: skip
+
+    once = run("once")
+    run("stopped", [False, False, True])
+    assert read_network(tmp_path / "stopped" / "state.safetensors")[1]["iteration"] == 3
+    assert same(once, run("stopped"))
+    assert same(once, run("again"))
+
+
+def test_a_run_of_another_stage_or_stack_is_not_gone_on_with(data: Path, tmp_path: Path, velocity_run: Path) -> None:
+    run = partial(train, data=data, run_dir=tmp_path, iterations=1, batch_size=1, threads=1, init=velocity_run)
+    run("cvm")
+    for stage, couplings in (("dm", 2), ("cvm", 3), ("vm", 2)):
+        with pytest.raises(InvalidOptions, match="takes another directory"):
+            run(stage, couplings=couplings)
+
+
 def test_a_settled_run_keeps_the_statistics_and_can_start_from_its_own_stage(
     data: Path, tmp_path: Path, velocity_run: Path
 ) -> None:
@@ -214,7 +236,7 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
     network = StraightPCF(couplings=1).eval()
     trained = network.velocity_modules
     loss_of = partial(velocity_loss, rows=64)
-    team = Team(1, network, trained, loss_of, [data], 2, (7,))
+    team = Team(1, network, trained, loss_of, [data], 2, 7)
     source = PatchSource.read(data)
     ours = source.draw(np.random.default_rng(8), 2)
 
@@ -223,8 +245,8 @@ def test_a_team_gives_the_mean_of_the_gradients(data: Path) -> None:
         (loss := loss_of(network, batch)).backward()
         return loss.item(), [p.grad.clone() for p in trained.parameters() if p.grad is not None]
 
-    # The member draws with the generator that also gave its dropout seed.
-    rng = np.random.default_rng((7, 1))
+    # The member draws with the generator of its iteration, that also gave its dropout seed.
+    rng = np.random.default_rng((7, 1, 1))
     rng.integers(2**62)
     theirs_loss, theirs_gradient = gradients(source.draw(rng, 2))
     ours_loss, ours_gradient = gradients(ours)
