@@ -44,7 +44,7 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; sampling: how its points lie, before the first pass; zoom: the factor by which the pass shows an
+    object seen whole; sampling: how its points lie; zoom: the factor by which the pass shows an
     object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
     patches, before the first pass (a scene's are all shown in one size, and d says as much); known_distances: what the
     DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a scene's
@@ -100,7 +100,12 @@ class NoiseReader:
         noise = self._noise_std(distances, scales)
         zoom, parts, in_radii, high_noise, uneven = 1.0, (1,), 0.0, False, False
         mapper = self._processor.mapper
-        sampling = Sampling.of(positions, probes, noise, mapper=mapper) if first is None else first.sampling
+        if first is None:
+            sampling = Sampling.of(positions, probes, noise, mapper=mapper)
+        elif distance < self._calibration.stirred:  # of more noise one surface has height, too
+            sampling = first.sampling.after_pass(positions, probes, mapper=mapper)
+        else:
+            sampling = first.sampling
         if first is None:
             in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -32,15 +32,17 @@ _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, a
 
 @dataclass(frozen=True)
 class Sampling:
-    """How points lie before the first pass.
+    """How points lie before a pass; all but the last two as before the first.
 
     irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
-    beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these.
+    beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
+    uncovered: whether that was asked again once a pass had taken most of the noise.
     """
 
     irregular: bool = False
     low_noise: float = 0.0
     thin_walls: bool = False
+    uncovered: bool = False
 
     @classmethod
     def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, mapper: Mapper = map) -> Sampling:
@@ -48,12 +50,16 @@ class Sampling:
 
         mapper: calls a function with the patches' rows, on threads if it has some.
         """
-        samples = max(_SAMPLES, _SAMPLES_OF_ALL // len(patches.index))
-        size, measure = patches.index.shape[1], partial(_PatchStatistics.at, xyz, samples, len(patches.index) == 1)
+        size, measure = patches.index.shape[1], partial(_PatchStatistics.at, *_looked_at(xyz, patches))
         found = list(mapper(measure, patches.index))
         irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(np.concatenate([s.areas for s in found]), noise_std)
         thin_walls = has_walls([s.between_walls for s in found])
         return cls(irregular, low_noise_weight([s.noise for s in found]), thin_walls)
+
+    def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
+        """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
+        found = list(mapper(partial(_between_walls, *_looked_at(xyz, patches)), patches.index))
+        return replace(self, thin_walls=self.thin_walls or has_walls(found), uncovered=True)
 
 
 @dataclass(frozen=True)
@@ -70,12 +76,25 @@ class _PatchStatistics:
 
     @classmethod
     def at(cls, xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> _PatchStatistics:
-        points = xyz[rows]
-        inner = inner_points(points, whole=whole)
-        near = Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP)
+        near = _nearest(xyz, samples, whole, rows)
         last = near.distances.shape[1] - 1
         areas = np.square(near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]])
         return cls(areas, noise_in_neighbourhoods(near), between_walls(near))
+
+
+def _looked_at(xyz: Floats, patches: Patches) -> tuple[Floats, int, bool]:
+    """Return the points, of how many of a patch's the neighbours are looked at, and whether a patch is all of them."""
+    return xyz, max(_SAMPLES, _SAMPLES_OF_ALL // len(patches.index)), len(patches.index) == 1
+
+
+def _nearest(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> Nearest:
+    points = xyz[rows]
+    inner = inner_points(points, whole=whole)
+    return Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP)
+
+
+def _between_walls(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> list[bool]:
+    return between_walls(_nearest(xyz, samples, whole, rows), uncovered=True)
 
 
 def _is_irregular(areas: Floats, noise_std: float) -> bool:

@@ -28,6 +28,8 @@ _QUADRIC_FROM = 64
 _MIDWAY_STDS = 0.5
 _WALLS_MIDWAY_SHARE, _MAYBE_WALLS_MIDWAY_SHARE = 0.27, 0.28
 _WALL_PATCHES_SHARE = 0.2
+# Where a pass has taken the noise of one surface, what still has height has walls: more neighbours may lie midway.
+_UNCOVERED_MIDWAY_SHARE = 0.33
 _THICK_RATIO = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
 # Moves across, in stds of the points about the wall that each is on: up to the first all is made of them, from the
 # second on nothing. What the network tells apart it moves by 0.4 to 1.0 of that, what it joins or blurs by 1.2 to 1.8.
@@ -64,10 +66,10 @@ class _Heights:
     def are_walls(self, few: float) -> bool:
         return self.midway < few and bool(self.thick.mean() > 0.5)
 
-    def share_left(self, step: Floats) -> float:
+    def share_left(self, step: Floats, few: float) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together."""
         thick = self.thick[: len(step)]
-        if not self.are_walls(_WALLS_MIDWAY_SHARE) or not thick.any():
+        if not self.are_walls(few) or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
         beside_noise = np.sqrt(np.square(rise).mean()) / max(self.noise, 1e-300)
@@ -110,9 +112,13 @@ class _LocalFit:
         return np.sqrt(left)
 
 
-def between_walls(near: Nearest) -> list[bool]:
-    """Say whether points of a patch may be on walls close together, by their nearest 24 and 64."""
-    return [_Heights.of(near.first(count)).are_walls(_MAYBE_WALLS_MIDWAY_SHARE) for count in _NEIGHBOUR_COUNTS[:2]]
+def between_walls(near: Nearest, *, uncovered: bool = False) -> list[bool]:
+    """Say whether points of a patch may be on walls close together, by their nearest 24 and 64.
+
+    uncovered: whether a pass has taken the noise of what is one surface.
+    """
+    few = _UNCOVERED_MIDWAY_SHARE if uncovered else _MAYBE_WALLS_MIDWAY_SHARE
+    return [_Heights.of(near.first(count)).are_walls(few) for count in _NEIGHBOUR_COUNTS[:2]]
 
 
 def has_walls(found: Sequence[Sequence[bool]]) -> bool:
@@ -120,13 +126,14 @@ def has_walls(found: Sequence[Sequence[bool]]) -> bool:
     return bool(np.mean(found, axis=0).max() > _WALL_PATCHES_SHARE)
 
 
-def share_between_walls(step: Floats, patch: Floats) -> float:
+def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False) -> float:
     """Return the share of a step (n, 3) that leaves walls apart: 0 where it joins them, 1 where there are none.
 
-    patch: (P, 3) points, of which the first n >= 1 make the step.
+    patch: (P, 3) points, of which the first n >= 1 make the step; uncovered: as of `between_walls`.
     """
+    few = _UNCOVERED_MIDWAY_SHARE if uncovered else _WALLS_MIDWAY_SHARE
     looked_at = np.arange(0, max(len(step), round(INNER_SHARE * len(patch))))
     looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
     some, their_step = patch[looked_at], step[looked_at[looked_at < len(step)]]
     near = Nearest.of(some, patch, max(_NEIGHBOUR_COUNTS))
-    return min(_Heights.of(near.first(count)).share_left(their_step) for count in _NEIGHBOUR_COUNTS)
+    return min(_Heights.of(near.first(count)).share_left(their_step, few) for count in _NEIGHBOUR_COUNTS)

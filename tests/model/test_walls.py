@@ -10,6 +10,7 @@ from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
+from straightpcf.points.options import DenoiseOptions
 from tests.clouds import even_sphere, noisy, sphere
 
 
@@ -53,6 +54,22 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
     result = load_filter(threads=2).denoise(rough)
     assert chamfer_distance(result.xyz, clean) <= 1.05 * chamfer_distance(rough, clean)
     assert any("walls closer together" in warning for warning in result.warnings)
+
+def test_walls_that_the_first_pass_uncovers_are_not_joined_by_the_next() -> None:
+    rough = noisy(plate(2000, 0.04), 0.0155)
+    assert not thin_walls(rough)
+    model = load_filter(threads=2)
+    once, twice = (model.denoise(rough, DenoiseOptions(iterations=passes)) for passes in (1, 2))
+    off = [np.sqrt(np.square(np.abs(result.xyz[:, 2]) - 0.02).mean()) for result in (once, twice)]
+    assert off[1] < 1.1 * off[0]
+    assert not any("walls" in warning for warning in once.warnings)
+    assert any("walls closer together" in warning for warning in twice.warnings)
+
+
+def test_a_noisy_surface_has_no_walls_after_a_pass() -> None:
+    for rough in (noisy(even_sphere(8000), 0.005), noisy(plate(2000, 0.0), 0.01)):
+        patches = cut_patches(rough, coverage=3.0, seed=0)
+        assert not Sampling.of(rough, patches, 0.0).after_pass(rough, patches).thin_walls
 
 
 def pipe(count: int, seed: int = 0) -> np.ndarray:
