@@ -104,6 +104,8 @@ class AsyncGrpcTransport(AsyncTransport):
             if upload is not None and upload.error is not None:
                 raise upload.error from None
             if not isinstance(error, grpc.RpcError):
+                if (task := asyncio.current_task()) is not None and not task.cancelling():
+                    self.check_open()  # closing it cancels its calls, but not who waits for them
                 raise
             attempts.failure = failed_rpc(error, self._url)
 

@@ -17,6 +17,8 @@ from straightpcf.points.errors import InvalidOptions, MissingDependency
 __all__ = ["CONNECT_TIMEOUT_SECONDS", "AsyncHttpTransport", "HttpTransport"]
 
 CONNECT_TIMEOUT_SECONDS = 10.0
+# A stream keeps its own for as long as its job runs; a process has descriptors for a thousand or so.
+_LIMITS = httpx2.Limits(max_connections=500, max_keepalive_connections=20)
 _Client = TypeVar("_Client", httpx2.Client, httpx2.AsyncClient)
 _FAULTS = (httpx2.TransportError, httpx2.SSEError)
 
@@ -91,7 +93,7 @@ def _made(kind: type[_Client], url: str, api_key: str | None, timeout: float | N
         raise InvalidOptions(f"{without_password(url)[:80]!r} is no address of a server: {exc}") from exc
     headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
     try:
-        return kind(base_url=base, headers=headers, timeout=_silence(timeout))
+        return kind(base_url=base, headers=headers, timeout=_silence(timeout), limits=_LIMITS)
     except ImportError as exc:
         raise MissingDependency("the environment (ALL_PROXY, ...) names a SOCKS proxy: pip install socksio") from exc
     except (httpx2.InvalidURL, ValueError, OSError) as exc:
@@ -100,12 +102,15 @@ def _made(kind: type[_Client], url: str, api_key: str | None, timeout: float | N
 
 
 def _request(call: Call, receiver: Receiver, timeout: float | None) -> dict[str, Any]:
+    silence = _silence(call.patience(timeout))
+    if call.timeout is None and math.isinf(call.until):
+        silence.pool = None  # to wait for other calls of this client is no silence of the server
     return {
         "method": call.method,
         "url": call.path,
         "params": call.params,
         "headers": {**call.all_headers(), **receiver.headers()},
-        "timeout": _silence(call.patience(timeout)),
+        "timeout": silence,
     }
 
 

@@ -9,7 +9,7 @@ import os
 import time
 import uuid
 from collections.abc import AsyncGenerator, Collection, Generator, Mapping
-from contextlib import closing
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -98,9 +98,13 @@ class Call:
 
     async def async_chunks(self) -> AsyncGenerator[bytes]:
         """Read the body off the event loop; raises as `chunks` does."""
-        with closing(self.chunks()) as chunks:
+        chunks = self.chunks()
+        try:
             while chunk := await asyncio.to_thread(next, chunks, b""):
                 yield chunk
+        finally:
+            with suppress(ValueError):  # of a cancelled upload a thread may still read, and ends it
+                chunks.close()
 
 
 def upload_call(

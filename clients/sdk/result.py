@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from straightpcf.clients.atomic import replaced_when_complete
 from straightpcf.clients.sdk.job_info import JobInfo, Report
+from straightpcf.points.errors import MissingDependency
 
 __all__ = ["Denoised"]
 
@@ -98,7 +99,10 @@ class Denoised:
 
     def to_open3d(self) -> Any:
         """Return an open3d cloud: a copy of the one that was sent, if one was, at the new positions."""
-        import open3d
+        try:
+            import open3d
+        except ModuleNotFoundError as exc:
+            raise MissingDependency("open3d is not installed; pip install 'straightpcf[open3d]' brings it") from exc
 
         cloud = open3d.geometry.PointCloud(self.source) if self.source is not None else open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(np.asarray(self.xyz, dtype=np.float64))

@@ -129,10 +129,13 @@ class _Patience:
     closed = False
     _has_answered = False
 
-    def attempts(self, step: Step) -> Attempts:
-        """Begin to count the attempts of one request; raises InvalidRequest of a client that is closed."""
+    def check_open(self) -> None:
+        """Raise InvalidRequest of a client that is closed, before each attempt: another task may close it."""
         if self.closed:
             raise InvalidRequest("this client is closed")
+
+    def attempts(self, step: Step) -> Attempts:
+        """Begin to count the attempts of one request."""
         patience = math.inf if self.timeout is None else self.timeout
         return Attempts(*step, self.max_retries, patience if self._has_answered else 0.0)
 
@@ -167,6 +170,7 @@ class Transport(_Patience, ABC):
         """Make one request until its receiver has it all, and yield whenever something came; raises its error."""
         attempts = self.attempts(step)
         while True:
+            self.check_open()
             yield from self.attempt(*step, attempts)
             if attempts.failure is None:
                 self._has_answered = True
@@ -204,6 +208,7 @@ class AsyncTransport(_Patience, ABC):
         """Do as `Transport.stream`."""
         attempts = self.attempts(step)
         while True:
+            self.check_open()
             async with aclosing(self.attempt(*step, attempts)) as coming:
                 async for _ in coming:
                     yield

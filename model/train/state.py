@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def save_state(
     path: Path, network: StraightPCF, average: Average, optimiser: torch.optim.Optimizer, rng: np.random.Generator,
     progress: dict[str, Any],
 ) -> None:  # fmt: skip
-    """Write everything that `load_state` restores; the file replaces the old one whole."""
+    """Write everything that `load_state` restores; the file replaces the old one whole, or OSError is raised."""
     tensors = {f"average.{name}": t.cpu().contiguous() for name, t in average.tensors.items()}
     for name, tensor in network.state_dict().items():
         if not torch.equal(tensor, average.tensors[name]):  # what is frozen is its own average
@@ -55,7 +56,12 @@ def save_state(
         tensors["cuda_rng"] = torch.cuda.get_rng_state()
     metadata = {"progress": json.dumps(progress), "numpy_rng": json.dumps(rng.bit_generator.state)}
     scratch = path.with_suffix(".tmp")
-    save_file(tensors, scratch, metadata=metadata)
+    try:
+        save_file(tensors, scratch, metadata=metadata)
+    except SafetensorError as exc:
+        raise OSError(f"{path} cannot be written: {exc}") from exc
+    with scratch.open("rb+") as file:  # on the disk before it takes the old one's place
+        os.fsync(file.fileno())
     scratch.replace(path)
 
 

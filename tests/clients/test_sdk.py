@@ -387,6 +387,12 @@ def test_a_client_that_is_closed_says_so() -> None:
             asyncio.run(ask_closed(url))
 
 
+def test_an_open3d_cloud_without_open3d_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(MissingDependency, match=r"straightpcf\[open3d\]"):
+        sdk.Denoised(job=SimpleNamespace(), request_id="", content=b"").to_open3d()  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("key", ["", " secret", "secret "])
 def test_a_key_that_no_header_keeps_is_refused_at_once(key: str) -> None:
     with pytest.raises(InvalidOptions, match="API key"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -288,6 +289,24 @@ def test_a_run_that_fails_ends_the_processes_that_share_its_batches(data: Path, 
     for process in multiprocessing.active_children():
         process.join(timeout=30)
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of a file's size are POSIX")
+def test_a_state_that_the_disk_has_no_room_for_is_a_files_error_and_the_old_one_stays(
+    data: Path, tmp_path: Path
+) -> None:
+    import resource
+
+    run = partial(train, "vm", data=data, run_dir=tmp_path, batch_size=1, rows=16, threads=1)
+    before = run(iterations=1).read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OSError, match="cannot be written"):
+            run(iterations=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (tmp_path / "state.safetensors").read_bytes() == before
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:

@@ -1,0 +1,91 @@
+"""The async client where calls are cut off, and where there are many."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import httpx2
+import pytest
+
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, http_transport, request, retry
+from straightpcf.points.errors import InvalidRequest
+
+HEALTHY = b'HTTP/1.1 200 OK\r\nContent-Length: 29\r\nConnection: close\r\n\r\n{"status":"ok","ready":true}\n'
+STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n: here\n\n"
+
+
+def test_calls_that_a_close_cuts_off_say_that_it_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+
+    async def close_meanwhile(url: str) -> None:
+        client = AsyncClient(url)
+        call = asyncio.create_task(client.health())
+        await asyncio.sleep(0.2)
+        await client.aclose()
+        with pytest.raises(InvalidRequest, match="closed"):
+            await call
+
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        for scheme in ("http", "grpc"):
+            asyncio.run(close_meanwhile(f"{scheme}://127.0.0.1:{silent.getsockname()[1]}"))
+
+
+def test_an_upload_that_is_cancelled_while_its_file_is_read_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scan.xyz").write_text("0 0 0\n" * 50)
+    reading, may_go_on = threading.Event(), threading.Event()
+
+    def slowly(path: Path, size: int) -> Iterator[bytes]:
+        reading.set()
+        may_go_on.wait(10)
+        yield path.read_bytes()
+
+    monkeypatch.setattr(request, "_read_chunks", slowly)
+
+    async def use(url: str) -> None:
+        async with AsyncClient(url, max_retries=0) as client:
+            task = asyncio.create_task(client.jobs.create(tmp_path / "scan.xyz"))
+            await asyncio.to_thread(reading.wait, 10)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            may_go_on.set()
+
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        asyncio.run(use(f"http://127.0.0.1:{silent.getsockname()[1]}"))
+
+
+def test_more_streams_than_a_pool_holds_keep_no_other_call_waiting_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_transport, "_LIMITS", httpx2.Limits(max_connections=2))
+    may_end = asyncio.Event()
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = await reader.readuntil(b"\r\n\r\n")
+        if b"/events" in head:
+            writer.write(STREAM)
+            await may_end.wait()
+        else:
+            writer.write(HEALTHY)
+        writer.close()
+
+    async def follow(client: AsyncClient) -> None:
+        async for _ in AsyncJob(client.jobs._transport, SimpleNamespace(id="a")).events():  # type: ignore[arg-type]
+            pass
+
+    async def use() -> None:
+        server = await asyncio.start_server(answer, "127.0.0.1", 0)
+        url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        async with server, AsyncClient(url, timeout=0.2, max_retries=0) as client:
+            streams = [asyncio.create_task(follow(client)) for _ in range(2)]
+            await asyncio.sleep(0.2)
+            asyncio.get_running_loop().call_later(0.5, may_end.set)
+            assert (await client.health()).ready
+            await asyncio.gather(*streams, return_exceptions=True)
+
+    asyncio.run(use())
