@@ -34,6 +34,8 @@ _REREAD_FROM, _REREAD_ABOVE = 0.4, 0.95
 # Where patches reach far, thin walls and bends are read as noise, so what is high there is read once more, of more of
 # the points shown at half their size, in patches no larger than this.
 _NEAR_RADIUS = 0.15
+# d after a pass below which what still has height is walls: with more noise left (0.42) a smooth body is taken for such.
+_UNCOVERED_BELOW = 0.35
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
@@ -44,12 +46,12 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; sampling: how its points lie; zoom: the factor by which the pass shows an
-    object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
-    patches, before the first pass (a scene's are all shown in one size, and d says as much); known_distances: what the
-    DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a scene's
-    points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass; uneven:
-    whether that pass shows no patch larger than the noise in it asks for.
+    object seen whole; sampling: how its points lie; zoom: the factor by which the pass shows an object larger; parts:
+    in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its patches, before the
+    first pass (a scene's are all shown in one size, and d says as much); known_distances: what the DistanceModule said
+    of patches of that pass, by number; noise_of_most: the noise std that four fifths of a scene's points have, or less;
+    high_noise: whether an object has more noise than HIGH_NOISE, before the first pass; uneven: whether that pass shows
+    no patch larger than the noise in it asks for.
     """
 
     distance: float
@@ -102,12 +104,11 @@ class NoiseReader:
         mapper = self._processor.mapper
         if first is None:
             sampling = Sampling.of(positions, probes, noise, mapper=mapper)
-        elif distance < self._calibration.stirred:  # of more noise one surface has height, too
+            in_radii = noise_in_radii(noise, probes.radii)
+        elif distance < _UNCOVERED_BELOW:
             sampling = first.sampling.after_pass(positions, probes, mapper=mapper)
         else:
             sampling = first.sampling
-        if first is None:
-            in_radii = noise_in_radii(noise, probes.radii)
         if self._zoom:
             if first is None:
                 noise = self._reread(positions, tiling, noise)

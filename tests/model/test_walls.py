@@ -55,6 +55,7 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
     assert chamfer_distance(result.xyz, clean) <= 1.05 * chamfer_distance(rough, clean)
     assert any("walls closer together" in warning for warning in result.warnings)
 
+
 def test_walls_that_the_first_pass_uncovers_are_not_joined_by_the_next() -> None:
     rough = noisy(plate(2000, 0.04), 0.0155)
     assert not thin_walls(rough)
