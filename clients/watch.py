@@ -50,6 +50,10 @@ def watch_folder(
                 continue
             if not once and before.get(path) != stamp:
                 continue  # perhaps it still grows
+            now = _stamp(path)  # its turn may come long after the look
+            if now is None or (now != stamp and not once):
+                continue
+            stamp = now
             try:
                 report = denoise(path, result)
                 os.utime(result, ns=(stamp[1], stamp[1]))

@@ -373,7 +373,10 @@ def _is_row(lines: Lines) -> npt.NDArray[np.bool_]:
     at = lines.starts[lines.first[is_row]]
     following = text[np.minimum(at + 1, len(text) - 1)]
     is_remark = (text[at] == ord("#")) | ((text[at] == ord("/")) & (following == ord("/")))
-    is_row[is_row] = ~is_remark | (text[at - 1] == ord('"'))  # a quoted cell may begin with anything
+    begins = lines.line_starts[is_row]
+    for row in np.flatnonzero(is_remark):  # a quoted cell may begin with anything
+        is_remark[row] = b'"' not in lines.raw[begins[row] : at[row]]
+    is_row[is_row] = ~is_remark
     return is_row
 
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -74,6 +75,27 @@ def test_a_file_that_is_replaced_while_it_is_worked_on_is_done_again(folder: Pat
     assert [next(outcomes), next(outcomes)] == ["first", "second"]
     assert (folder / "clean" / "scan.ply").read_bytes() == b"second"
     assert once(folder) == []
+
+
+@pytest.mark.parametrize("is_once", [True, False])
+def test_what_is_taken_away_before_its_turn_is_no_failure_and_what_grows_is_let_grow(
+    folder: Path, *, is_once: bool
+) -> None:
+    later, gone = folder / "y later.ply", folder / "x gone.ply"
+    later.write_bytes(b"half")
+    gone.write_bytes(b"gone")
+    seen: list[bytes] = []
+
+    def change(source: Path, target: Path) -> str:
+        seen.append(source.read_bytes())
+        if source.name == "scan.ply":
+            gone.unlink()
+            later.write_bytes(b"whole one")
+        return copy(source, target)
+
+    outcomes = once(folder, change) if is_once else list(islice(watched(folder, change), 2))
+    assert outcomes == ["first", "whole one"]
+    assert seen == [b"first", b"whole one"]
 
 
 def test_what_is_done_stays_done_for_the_next_process_until_it_changes(folder: Path) -> None:

@@ -77,6 +77,7 @@ TABLES = {
     "one quote in a line": b'1,2,3,5" thick\n4,5,6,7" thick\n',
     "quotes in quotes": b'1,2,3,"an ""oak"", old"\n4,5,6,\n',
     "a quoted number sign": b'k,x,y,z\n"#1",1,2,3\n"//",4,5,6\n',
+    "a quoted number sign behind a space": b'k,x,y,z\n" #1",1,2,3\n"\t//",4,5,6\n',
     "words": b"1 2 3 tree 7\n4 5 6 house 8\n",
     "text that is no UTF-8": b"# \xe9\n1 2 3 \xff\n4 5 6 \xfe\n",
 }
