@@ -34,7 +34,7 @@ _REREAD_FROM, _REREAD_ABOVE = 0.4, 0.95
 # Where patches reach far, thin walls and bends are read as noise, so what is high there is read once more, of more of
 # the points shown at half their size, in patches no larger than this.
 _NEAR_RADIUS = 0.15
-# d after a pass below which what still has height is walls: with more noise left (0.42) a smooth body is taken for such.
+# Of d after a pass: below it, what still has height is walls. With more noise left (0.42) a smooth body looks so, too.
 _UNCOVERED_BELOW = 0.35
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
