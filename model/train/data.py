@@ -225,10 +225,13 @@ class PatchSource:
         self.clouds: list[npt.NDArray[np.float64]] = []
         self.surfaces: list[Surface] = []
         self.eyes: list[npt.NDArray[np.float64] | None] = []
+        self.by_name: dict[tuple[Path, str], Surface] = {}  # of shapes that were read, in their own coordinates
+        self._own: list[Surface] = []
         unknown = [None] * len(shapes)
         beside = zip(shapes, normals or unknown, surfaces or unknown, eyes or unknown, strict=True)
         for shape, given, surface, eye in beside:
             own = Surface.of(shape, given, surface)
+            self._own.append(own)
             for cloud in shape:
                 wide = cloud.astype(np.float64)
                 frame = CloudFrame.of(wide)
@@ -272,7 +275,9 @@ class PatchSource:
             finest = beside["surface"].get((path, shape), max(clouds, key=len, default=normals))
             if len(normals) != len(finest):
                 raise MalformedFile(f"{path}: {shape}/normals has {len(normals)} rows for {len(finest)} points")
-        return cls(list(shapes.values()), *([known.get(key) for key in shapes] for known in beside.values()))
+        source = cls(list(shapes.values()), *([known.get(key) for key in shapes] for known in beside.values()))
+        source.by_name = dict(zip(shapes, source._own, strict=True))
+        return source
 
     def draw(self, rng: np.random.Generator, batch_size: int, *, augment: bool = True) -> Batch:
         """Draw a batch; all randomness comes from `rng`."""

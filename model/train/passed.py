@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,17 +45,25 @@ def training_patches(data: Sequence[Path], passed: Sequence[Path], distance: nn.
     """Read the training clouds of the archives `data`, and those after passes of the archives `passed`."""
     source = PatchSource.read(*data)
     if passed:
-        source.passed = PassedClouds(passed, data, distance)
+        source.passed = PassedClouds(passed, data, distance, known=source.by_name)
     return source
 
 
 class PassedClouds:
     """Draw patches of recorded clouds, each led to the surface by the way that the DistanceModule says it has to go."""
 
-    def __init__(self, paths: Sequence[Path], data: Sequence[Path], distance: nn.Module) -> None:
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        data: Sequence[Path],
+        distance: nn.Module,
+        *,
+        known: Mapping[tuple[Path, str], Surface] | None = None,
+    ) -> None:
         """Read what `write_passed` wrote of the shapes of the archives `data`; raises InvalidOptions where one lacks.
 
-        distance: (B, PATCH_SIZE, 3) float32 patches -> (B, 1); it is asked without a gradient.
+        distance: (B, PATCH_SIZE, 3) float32 patches -> (B, 1); it is asked without a gradient. known: surfaces of
+        shapes by archive and name, so that their normals are computed once.
         """
         archives = {path.stem: path for path in data}
         surfaces: dict[tuple[str, str], Surface] = {}
@@ -69,7 +77,8 @@ class PassedClouds:
                     if archive not in archives:
                         raise InvalidOptions(f"{path} has clouds of {archive}.npz, which is not among the data")
                     if (archive, shape) not in surfaces:
-                        surfaces[archive, shape] = _surface(archives[archive], shape)
+                        found = (known or {}).get((archives[archive], shape))
+                        surfaces[archive, shape] = found or _surface(archives[archive], shape)
                     xyz = recorded[name].astype(np.float64)
                     *centre, radius = recorded[f"{name.rpartition('/')[0]}/frame"].tolist()
                     frame = CloudFrame(np.array(centre), radius)

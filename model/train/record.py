@@ -6,7 +6,12 @@ python -m straightpcf.model.train.record passed.npz --data punet_train.npz
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import json
+import signal
+import sys
+import time
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +27,11 @@ from straightpcf.points.options import DenoiseOptions
 __all__ = ["write_passed"]
 
 Floats = npt.NDArray[np.float64]
+Clouds = tuple[list[Floats], Floats | None]  # of a shape, the coarsest first, and where its beams came from
 
 LEVELS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03)  # noise std, in radii of the bounding sphere
 COARSEST_SHARE = 0.75  # of the clouds; a finer one takes several times as long
+_KEPT_EVERY, _PROGRESS = 300.0, "progress"  # seconds
 
 
 def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int, *, seed: int = 0) -> None:
@@ -32,29 +39,78 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
 
     Shapes that are held out stay out. A cloud is named `<archive>/<shape>/<number>/xyz`, (N, 3) float32 in the
     frame in which the filter has it; `<archive>/<shape>/<number>/frame` is that one's centre and radius among the clean
-    points.
+    points. What is there so far is kept beside `path` now and then and where this is interrupted, and gone on with.
     """
     rng = np.random.default_rng(seed)
     shapes = {archive: _training_clouds(archive) for archive in data}
+    part = path.with_suffix(".part.npz")
+    of = [seed, [archive.stem for archive in data], _digest(denoiser)]
+    written = _gone_on_with(part, of, rng)
+    kept_at, state = time.monotonic(), rng.bit_generator.state
+    _keep(part, written, of, state)  # a folder that takes no file is found out before the work
+    try:
+        while len(written) < 2 * count:
+            more = _recorded(denoiser, data, shapes, rng, len(written) // 2)
+            written, state = written | more, rng.bit_generator.state
+            if time.monotonic() - kept_at > _KEPT_EVERY:
+                _keep(part, written, of, state)
+                kept_at = time.monotonic()
+        np.savez(path, **written)  # type: ignore[arg-type]
+    except BaseException:
+        _keep(part, written, of, state)
+        raise
+    part.unlink()
+
+
+def _recorded(
+    denoiser: Filter, data: Sequence[Path], shapes: Mapping[Path, Mapping[str, Clouds]], rng: np.random.Generator,
+    number: int,
+) -> dict[str, npt.NDArray[np.generic]]:  # fmt: skip
+    """Filter one noisy cloud, and return what is written of it, from that number on."""
     written: dict[str, npt.NDArray[np.generic]] = {}
-    while len(written) < 2 * count:
-        archive = data[int(rng.integers(len(data)))]
-        names = list(shapes[archive])
-        shape = names[int(rng.integers(len(names)))]
-        clouds, eye = shapes[archive][shape]
-        finer = clouds[1:] if rng.random() >= COARSEST_SHARE else []
-        clean = (finer or clouds[:1])[int(rng.integers(len(finer or clouds[:1])))]
-        own = CloudFrame.of(clean)
-        noise = LEVELS[int(rng.integers(len(LEVELS)))] * drawn_noise(rng, clean, eye)
-        run = _Recording(denoiser, own.enter(clean) + noise, DenoiseOptions(iterations=3 if finer else 4))
-        for _ in run.patches():
-            pass
-        for xyz in run.seen:
-            key = f"{archive.stem}/{shape}/{len(written) // 2}"
-            centre = own.centre + own.radius * run.frame.centre
-            written[f"{key}/xyz"] = xyz.astype(np.float32)
-            written[f"{key}/frame"] = np.array([*centre, own.radius * run.frame.radius])
-    np.savez(path, **written)  # type: ignore[arg-type]
+    archive = data[int(rng.integers(len(data)))]
+    names = list(shapes[archive])
+    shape = names[int(rng.integers(len(names)))]
+    clouds, eye = shapes[archive][shape]
+    finer = clouds[1:] if rng.random() >= COARSEST_SHARE else []
+    clean = (finer or clouds[:1])[int(rng.integers(len(finer or clouds[:1])))]
+    own = CloudFrame.of(clean)
+    noise = LEVELS[int(rng.integers(len(LEVELS)))] * drawn_noise(rng, clean, eye)
+    run = _Recording(denoiser, own.enter(clean) + noise, DenoiseOptions(iterations=3 if finer else 4))
+    for _ in run.patches():
+        pass
+    for xyz in run.seen:
+        key = f"{archive.stem}/{shape}/{number + len(written) // 2}"
+        centre = own.centre + own.radius * run.frame.centre
+        written[f"{key}/xyz"] = xyz.astype(np.float32)
+        written[f"{key}/frame"] = np.array([*centre, own.radius * run.frame.radius])
+    return written
+
+
+def _gone_on_with(part: Path, of: list[object], rng: np.random.Generator) -> dict[str, npt.NDArray[np.generic]]:
+    """Return what `_keep` kept of a recording of the same, with `rng` as it was then; of another, nothing."""
+    if not part.exists():
+        return {}
+    with np.load(part, allow_pickle=False) as file:
+        theirs, state = json.loads(str(file[_PROGRESS]))
+        if theirs != of:
+            return {}
+        rng.bit_generator.state = state
+        return {name: file[name] for name in file.files if name != _PROGRESS}
+
+
+def _keep(part: Path, written: Mapping[str, npt.NDArray[np.generic]], of: list[object], state: object) -> None:
+    scratch = part.with_suffix(".tmp.npz")
+    np.savez(scratch, **{_PROGRESS: np.array(json.dumps([of, state]))}, **written)  # type: ignore[arg-type]
+    scratch.replace(part)
+
+
+def _digest(denoiser: Filter) -> int:
+    """Tell weights from others."""
+    digest = 0
+    for tensor in denoiser.network.state_dict().values():
+        digest = zlib.crc32(tensor.cpu().numpy().tobytes(), digest)
+    return digest
 
 
 class _Recording(Run):
@@ -68,17 +124,23 @@ class _Recording(Run):
         yield from super()._pass(here, tiling, left)
 
 
-def _training_clouds(archive: Path) -> dict[str, tuple[list[Floats], Floats | None]]:
+def _training_clouds(archive: Path) -> dict[str, Clouds]:
     """Return the clean clouds of each shape that is not held out, the coarsest first, and where its beams came from."""
     with np.load(archive, allow_pickle=False) as file:
         held_out = held_out_shapes(file.files)
         names = [name.split("/") for name in file.files]
-        found: dict[str, tuple[list[Floats], Floats | None]] = {}
+        found: dict[str, Clouds] = {}
         for shape, points in sorted((s, int(what)) for s, what in names if what.isdigit() and s not in held_out):
             if shape not in found:
                 found[shape] = [], file[f"{shape}/eye"].astype(np.float64) if f"{shape}/eye" in file else None
             found[shape][0].append(file[f"{shape}/{points}"].astype(np.float64))
         return found
+
+
+def _interrupt(number: int, frame: object) -> None:
+    for each in (signal.SIGINT, signal.SIGTERM):  # `timeout` sends two, and what is there is being kept
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def _main() -> None:
@@ -95,7 +157,13 @@ def _main() -> None:
         denoiser.network.velocity_modules.load_state_dict(
             read_network(options.weights)[0].velocity_modules.state_dict()
         )
-    write_passed(options.path, denoiser, options.data, options.count, seed=options.seed)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+    try:
+        write_passed(options.path, denoiser, options.data, options.count, seed=options.seed)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; the same command goes on from what it has\n")
+        sys.exit(130)
 
 
 if __name__ == "__main__":

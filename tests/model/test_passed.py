@@ -11,8 +11,10 @@ import torch
 
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.normals import recompute_normals
 from straightpcf.model.patches import PATCH_SIZE
-from straightpcf.model.train import train
+from straightpcf.model.train import data as train_data
+from straightpcf.model.train import record, train
 from straightpcf.model.train.data import PASSED, PatchSource, held_out_shapes
 from straightpcf.model.train.device_data import DevicePatchSource
 from straightpcf.model.train.losses import across, precision
@@ -49,6 +51,32 @@ def test_recorded_clouds_lie_about_their_shapes_and_none_is_held_out(passed: Pat
             assert places.shape == (2000, 3)
             off = distance_to_torus(places) if int(shape[-2:]) % 2 else np.linalg.norm(places, axis=1) - 1
             assert np.abs(np.median(off)) < 0.1
+
+
+def test_a_recording_that_was_interrupted_goes_on_to_the_same_clouds(
+    passed: Path, data: Path, network: StraightPCF, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, begun = tmp_path / "passed.npz", record._recorded
+    left = iter([1, 2])
+
+    def interrupted(*arguments: object) -> dict[str, np.ndarray]:
+        if next(left) == 2:
+            raise KeyboardInterrupt
+        return begun(*arguments)  # type: ignore[arg-type]
+
+    denoiser = Filter(network, threads=2, coverage=2)
+    monkeypatch.setattr(record, "_recorded", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_passed(path, denoiser, [data], 4, seed=3)
+    assert not path.exists()
+    kept = path.with_suffix(".part.npz")
+    assert len(np.load(kept).files) > 1
+    monkeypatch.setattr(record, "_recorded", begun)
+    write_passed(path, denoiser, [data], 4, seed=3)
+    with np.load(path) as ours, np.load(passed) as once:
+        assert ours.files == once.files
+        assert all(np.array_equal(ours[name], once[name]) for name in once.files)
+    assert not kept.exists()
 
 
 @pytest.mark.parametrize("on_device", [False, True])
@@ -119,6 +147,25 @@ def test_a_run_takes_them_and_its_team_too(passed: Path, data: Path, tmp_path: P
     assert state.is_file()
     with pytest.raises(InvalidOptions, match="are for stage 'cvm'"):
         train("dm", run_dir=tmp_path / "dm", passed=[passed], **wanted)  # type: ignore[arg-type]
+
+
+def test_the_normals_of_a_shape_are_computed_once(
+    passed: Path, data: Path, network: StraightPCF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def recompute(xyz: np.ndarray, old: np.ndarray) -> np.ndarray:
+        asked.append(len(xyz))
+        return recompute_normals(xyz, old)
+
+    monkeypatch.setattr(train_data, "recompute_normals", recompute)
+    source = training_patches([data], [passed], network.distance_module)
+    assert len(asked) == len(source.clouds) == 10
+    again = PassedClouds([passed], [data], network.distance_module)
+    assert isinstance(source.passed, PassedClouds)
+    for ours, theirs in zip(source.passed.clouds, again.clouds, strict=True):
+        assert np.array_equal(ours.surface.xyz, theirs.surface.xyz)
+        assert np.array_equal(ours.surface.normals, theirs.surface.normals)
 
 
 def test_clouds_of_shapes_that_are_not_there_are_refused_by_name(passed: Path, data: Path, tmp_path: Path) -> None:
