@@ -105,7 +105,7 @@ class NoiseReader:
         if first is None:
             sampling = Sampling.of(positions, probes, noise, mapper=mapper)
             in_radii = noise_in_radii(noise, probes.radii)
-        elif distance < _UNCOVERED_BELOW:
+        elif distance < _UNCOVERED_BELOW and first.parts == (1,):  # what parts leave lies in layers
             sampling = first.sampling.after_pass(positions, probes, mapper=mapper)
         else:
             sampling = first.sampling
