@@ -58,8 +58,8 @@ class Sampling:
 
     def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
-        found = list(mapper(partial(_between_walls, *_looked_at(xyz, patches)), patches.index))
-        return replace(self, thin_walls=self.thin_walls or has_walls(found), uncovered=True)
+        look = partial(_between_walls, *_looked_at(xyz, patches))
+        return replace(self, thin_walls=self.thin_walls or has_walls(list(mapper(look, patches.index))), uncovered=True)
 
 
 @dataclass(frozen=True)

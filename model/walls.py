@@ -88,7 +88,7 @@ class _LocalFit:
 
     @classmethod
     def of(cls, near: Neighbourhoods) -> _LocalFit:
-        """Take quadrics where there are as many neighbours as _BENT."""
+        """Take quadrics where there are as many neighbours as _QUADRIC_FROM."""
         _, u, v = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
         terms = [np.ones_like(u), u, v]
         if u.shape[1] >= _QUADRIC_FROM:

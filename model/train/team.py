@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -16,6 +14,7 @@ import torch
 from torch import multiprocessing
 
 from straightpcf.model.allocator import keep_large_buffers
+from straightpcf.model.children import signals_kept
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch
 from straightpcf.model.train.passed import training_patches
@@ -58,7 +57,7 @@ class Team:
             gradient.share_memory_()  # type: ignore[no-untyped-call]
             arguments = (theirs, network, trained, loss, gradient, data, batch_size, (seed, number), passed)
             process = context.Process(target=_work, args=arguments, daemon=True)
-            with _signals_kept():
+            with signals_kept(_LEADERS_OWN):
                 process.start()
             self._processes.append(process)
             theirs.close()
@@ -103,20 +102,6 @@ class Team:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-@contextmanager
-def _signals_kept() -> Iterator[None]:
-    """Keep signals to the group from a process that begins meanwhile, for good: it ends with its team."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # which else begins here, and lets them through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEADERS_OWN)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(

@@ -5,12 +5,9 @@ from __future__ import annotations
 import asyncio
 import atexit
 import multiprocessing
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from typing import Any
 
+from straightpcf.model.children import signals_kept
 from straightpcf.points.errors import ERRORS_BY_CODE, InternalError
 from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
 from straightpcf.service.backends.worker import (
@@ -44,7 +41,7 @@ class WorkerProcess:
         self._process = _SPAWN.Process(
             target=run_worker, args=(theirs, spec), daemon=True, name=f"straightpcf-worker-{spec.device}"
         )
-        with _undisturbed():
+        with signals_kept(SERVERS_OWN):  # until `run_worker` sees to them
             self._process.start()
         # Where a server ends without `stop`, multiprocessing would ask with SIGTERM, and wait for ever.
         atexit.register(self._process.kill)
@@ -150,14 +147,3 @@ class WorkerProcess:
         if code is None:
             return "was ended"
         return f"ended with exit code {code}" if code >= 0 else f"was killed by signal {-code}"
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Keep signals to the group from a process that begins meanwhile, until `run_worker` sees to them."""
-    resource_tracker.ensure_running()  # which else begins here, and lets them through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SERVERS_OWN)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
