@@ -154,7 +154,7 @@ def upload_call(
     id = id or uuid.uuid4().hex
     if not JOB_ID.fullmatch(id):
         raise InvalidRequest(f"job id is {id[:80]!r}; it must be {JOB_ID_RULE}")
-    fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id}
+    fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id, "bytes": size}
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
     return Call(
         method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body,

@@ -43,16 +43,18 @@ class DenoiseOptions(_message.Message):
     def __init__(self, iterations: _Optional[int] = ..., seed: _Optional[int] = ..., strength: _Optional[float] = ..., recompute_normals: _Optional[bool] = ...) -> None: ...
 
 class JobConfig(_message.Message):
-    __slots__ = ("options", "filename", "format", "id")
+    __slots__ = ("options", "filename", "format", "id", "bytes")
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     FILENAME_FIELD_NUMBER: _ClassVar[int]
     FORMAT_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
+    BYTES_FIELD_NUMBER: _ClassVar[int]
     options: DenoiseOptions
     filename: str
     format: str
     id: str
-    def __init__(self, options: _Optional[_Union[DenoiseOptions, _Mapping]] = ..., filename: _Optional[str] = ..., format: _Optional[str] = ..., id: _Optional[str] = ...) -> None: ...
+    bytes: int
+    def __init__(self, options: _Optional[_Union[DenoiseOptions, _Mapping]] = ..., filename: _Optional[str] = ..., format: _Optional[str] = ..., id: _Optional[str] = ..., bytes: _Optional[int] = ...) -> None: ...
 
 class DenoiseConfig(_message.Message):
     __slots__ = ("job", "patches", "return_file")

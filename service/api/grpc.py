@@ -246,9 +246,10 @@ class DenoiseService(stubs.DenoiseServiceServicer):
         options = DenoiseOptions(**plain_of(config.options))
         if config.format:
             format_named(config.format)
-        await engine.check_room(owner=caller.owner, id=id, idempotency_key=caller.idempotency_key)
+        size = config.bytes if config.HasField("bytes") else None
+        await engine.check_room(size=size or 0, owner=caller.owner, id=id, idempotency_key=caller.idempotency_key)
         with engine.upload() as source:
-            await in_time(engine, _receive(requests, source, engine))
+            await in_time(engine, _receive(requests, source, engine, size))
             wanted = JobRequest(
                 options=options,
                 name=file_name(config.filename or None),
@@ -285,8 +286,8 @@ async def _first(requests: AsyncIterator[_Part], engine: Engine) -> _Part:
     return message
 
 
-async def _receive(requests: AsyncIterator[Any], target: Path, engine: Engine) -> None:
-    """Write the chunks of a call to a file."""
+async def _receive(requests: AsyncIterator[Any], target: Path, engine: Engine, size: int | None) -> None:
+    """Write the chunks of a call to a file; raises InvalidRequest where they are not of the size that was said."""
     received = 0
     with await asyncio.to_thread(target.open, "wb") as file:
         spool = SpoolFile(file, engine)
@@ -296,6 +297,8 @@ async def _receive(requests: AsyncIterator[Any], target: Path, engine: Engine) -
             engine.limits.check_bytes(received := received + len(message.chunk))
             spool.buffer += message.chunk
             await spool.flush(above=WRITE_BYTES)
+        if size is not None and received != size:  # a call that is cancelled ends like one that is whole
+            raise InvalidRequest(f"the file has {received} bytes; its config says {size}")
         await spool.flush()
 
 

@@ -167,6 +167,21 @@ def test_a_call_against_the_contract_is_refused(stub: Any, name: str) -> None:
     }
 
 
+@pytest.mark.parametrize("said", [len(SMALL) - 1, len(SMALL) + 1, 0])
+def test_a_file_of_another_size_than_was_said_makes_no_job(stub: Any, said: int) -> None:
+    before = list(stub.ListJobs(pb.ListJobsRequest()).jobs)
+    config = pb.JobConfig(filename="cloud.npy", bytes=said)
+    status, info = error_of(lambda: stub.CreateJob(parts(pb.CreateJobRequest, config, SMALL)))
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "INVALID_REQUEST")
+    assert list(stub.ListJobs(pb.ListJobsRequest()).jobs) == before
+
+
+def test_a_file_that_is_said_to_be_too_large_is_refused_before_it_comes(stub: Any) -> None:
+    config = pb.CreateJobRequest(config=pb.JobConfig(filename="cloud.npy", bytes=2**62))
+    status, info = error_of(lambda: stub.CreateJob(iter([config])))
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "TOO_MANY_BYTES")
+
+
 def test_a_stream_of_another_schema_is_the_callers_fault(server: RunningServer, channel: Any) -> None:
     call = channel.stream_unary("/straightpcf.v1.DenoiseService/CreateJob")
     status, info = error_of(lambda: call(iter([b"\xff\xff"])))
