@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 __all__ = [
     "HIGH_NOISE",
+    "LARGEST_RADIUS",
+    "SMALLEST_RADIUS",
     "CloudFrame",
     "is_scene",
     "noise_in_radii",
@@ -21,7 +23,7 @@ __all__ = [
 
 # Patch radii seen in training, in radii of the object's bounding sphere: the 1st percentile of punet_train.npz at 10K
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training-log.md, "The first run").
-_SMALLEST_RADIUS, _LARGEST_RADIUS = 0.1, 0.58
+SMALLEST_RADIUS, LARGEST_RADIUS = 0.1, 0.58
 _MEDIAN_RADIUS = 0.25  # their median
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
@@ -144,6 +146,6 @@ def patch_scales(
     nearest that was seen). Patches that would be smaller or larger than any in training are brought to these limits,
     the upper one zoomed. One of radius 0 keeps the factor 1.
     """
-    largest = np.maximum(1.0, zoom) * _LARGEST_RADIUS
-    wanted = np.clip(zoom * radii, _MEDIAN_RADIUS if scene else _SMALLEST_RADIUS, largest)
+    largest = np.maximum(1.0, zoom) * LARGEST_RADIUS
+    wanted = np.clip(zoom * radii, _MEDIAN_RADIUS if scene else SMALLEST_RADIUS, largest)
     return np.where(radii > 0, wanted / np.where(radii > 0, radii, 1.0), 1.0)

@@ -17,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.normalize import CloudFrame, zoom_of
+from straightpcf.model.normalize import CloudFrame, patch_scales, zoom_of
 from straightpcf.model.normals import recompute_normals
 from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.points.errors import InvalidOptions, MalformedFile, TooFewPoints
@@ -293,15 +293,14 @@ class PatchSource:
         which = int(rng.integers(len(self.clouds)))
         cloud, tree = self.clouds[which], self._trees[which]
         seed = cloud[rng.integers(len(cloud))]
-        _, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
+        reach, near = tree.query(seed, k=min(CANDIDATES, len(cloud)))
         clean = cloud[near]  # row 0 is the seed
-        scale = rng.uniform(*SCALES) if augment else 1.0
+        scale, zoom, noise = rng.uniform(*SCALES) if augment else 1.0, 1.0, None
         if rng.random() < (FIRST_PASSES if self.passed is None else FIRST_PASSES / (1 - PASSED)):
             level = rng.integers(len(FIRST_NOISE))
-            scale *= self.zooms[which, level]
-            time = max(EARLIEST, 1 - scale * FIRST_NOISE[level] / NOISE_STD)
-        else:
-            time = rng.uniform(0, 1)
+            zoom, noise = self.zooms[which, level], FIRST_NOISE[level]
+        scale *= patch_scales(reach[PATCH_SIZE - 1 : PATCH_SIZE], scene=False, zoom=zoom)[0]
+        time = rng.uniform(0, 1) if noise is None else max(EARLIEST, 1 - scale * noise / NOISE_STD)
         here = clean + (1 - time) * NOISE_STD / scale * drawn_noise(rng, clean, self.eyes[which])
         origin = here[0]
         # Cut at x_t, as the filter cuts: a patch cut at x_0 has a rim as ragged as that noise, which tells the time.

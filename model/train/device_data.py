@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.normalize import LARGEST_RADIUS, SMALLEST_RADIUS
 from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train.data import (
     ALONG_BEAMS,
@@ -50,7 +51,7 @@ class DevicePatchSource:
 
     def __init__(self, source: PatchSource, device: torch.device) -> None:
         self._counts = torch.tensor([len(cloud) for cloud in source.clouds], device=device)
-        self._candidates = min([CANDIDATES, *map(len, source.clouds)])
+        self._candidates = min(CANDIDATES, max(map(len, source.clouds)))
         self._clouds = _padded(source.clouds, device)
         self._noise = torch.from_numpy(FIRST_NOISE).float().to(device)
         self._zooms = torch.from_numpy(source.zooms).float().to(device)
@@ -75,9 +76,9 @@ class DevicePatchSource:
         clouds = self._clouds[which]  # (B, N, 3)
         seed = gathered(clouds, seeds[:, None])
         clean = gathered(clouds, _nearest(clouds, seed, self._candidates))  # the seed first
-        time, scale = self._shown(which, first_passes)
-        noisy = clean + NOISE_STD / scale * _noise(clean, self._eyes[which])
-        here = torch.lerp(noisy, clean, time)
+        time, scale = self._shown(which, first_passes, (clean[:, PATCH_SIZE - 1] - seed[:, 0]).norm(dim=1))
+        noise = NOISE_STD / scale * _noise(clean, self._eyes[which])
+        noisy, here = clean + noise, clean + (1 - time) * noise  # infinitely far where the cloud has no more points
         origin = here[:, :1]
         inside = _near_first(_nearest(here, origin, PATCH_SIZE))  # cut at x_t, as PatchSource does
         noisy, here, clean = (gathered(part, inside) for part in (noisy, here, clean))
@@ -91,15 +92,17 @@ class DevicePatchSource:
         noisy = torch.where(early, torch.lerp(touched, here, 1 / (1 - time)), noisy)
         return replace(batch, noisy=noisy, clean=touched)
 
-    def _shown(self, which: torch.Tensor, first_passes: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw the times and sizes, (B, 1, 1), in which patches of the clouds numbered `which` (B,) are shown."""
+    def _shown(
+        self, which: torch.Tensor, first_passes: float, radii: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw the times and sizes, (B, 1, 1), in which patches of radii (B,) of the clouds `which` (B,) are shown."""
         first, time, scale = torch.rand(3, len(which), device=which.device)
         scale = SCALES[0] + (SCALES[1] - SCALES[0]) * scale
         level = torch.randint(len(self._noise), which.shape, device=which.device)
-        zoomed = scale * self._zooms[which, level]
         early = first < first_passes
-        time = torch.where(early, (1 - zoomed * self._noise[level] / NOISE_STD).clamp(min=EARLIEST), time)
-        return time.view(-1, 1, 1), torch.where(early, zoomed, scale).view(-1, 1, 1)
+        scale = scale * _patch_scales(radii, torch.where(early, self._zooms[which, level], 1.0))
+        time = torch.where(early, (1 - scale * self._noise[level] / NOISE_STD).clamp(min=EARLIEST), time)
+        return time.view(-1, 1, 1), scale.view(-1, 1, 1)
 
 
 class _Passed:
@@ -126,6 +129,8 @@ class _Passed:
         origin = gathered(clouds, seeds[:, None])
         inside = _near_first(_nearest(clouds, origin, PATCH_SIZE))
         scale = SCALES[0] + (SCALES[1] - SCALES[0]) * torch.rand(batch_size, 1, 1, device=device)
+        radii = (gathered(clouds, inside) - origin).norm(dim=2).amax(dim=1)
+        scale = scale * _patch_scales(radii, torch.ones_like(radii)).view(-1, 1, 1)
         turn = random_rotations(batch_size, device)
         here = (gathered(clouds, inside) - origin) @ turn * scale
         with torch.no_grad():
@@ -162,6 +167,12 @@ class _Surfaces:
         places = torch.linspace(0, 1, AROUND, device=near.device) * (self._reach[which, None] - 1)
         near = near.gather(1, places.long())
         return gathered(surface, near), gathered(normals, near)
+
+
+def _patch_scales(radii: torch.Tensor, zoom: torch.Tensor) -> torch.Tensor:
+    """Do for objects' patches of radii (B,), shown `zoom` (B,) times their size, what `patch_scales` does: (B,)."""
+    wanted = torch.minimum((zoom * radii).clamp(min=SMALLEST_RADIUS), zoom.clamp(min=1.0) * LARGEST_RADIUS)
+    return wanted / radii
 
 
 def _nearest(points: torch.Tensor, seeds: torch.Tensor, count: int) -> torch.Tensor:

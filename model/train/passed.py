@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train.data import (
     REACH,
@@ -98,8 +98,8 @@ class PassedClouds:
         """
         cloud = self.clouds[rng.integers(len(self.clouds))]
         origin = cloud.xyz[rng.integers(len(cloud.xyz))]
-        _, near = cloud.tree.query(origin, k=PATCH_SIZE)
-        scale = rng.uniform(*SCALES)
+        reach, near = cloud.tree.query(origin, k=PATCH_SIZE)
+        scale = rng.uniform(*SCALES) * patch_scales(reach[-1:], scene=False)[0]
         transform = scale * np.asarray(Rotation.random(random_state=rng).as_matrix())
         here = cloud.xyz[near]
         shown = torch.from_numpy(((here - origin) @ transform).astype(np.float32))

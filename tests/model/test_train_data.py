@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.normalize import LARGEST_RADIUS
 from straightpcf.model.patches import PATCH_SIZE
-from straightpcf.model.train.data import EARLIEST, NOISE_STD, Batch, PatchSource
+from straightpcf.model.train.data import EARLIEST, NOISE_STD, SCALES, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision
 from straightpcf.model.turns import turns
@@ -74,8 +75,8 @@ def test_the_rim_of_a_patch_does_not_tell_the_time(*, on_device: bool) -> None:
 
 
 @pytest.mark.parametrize("on_device", [False, True])
-def test_paths_are_taken_up_before_their_start_too(data: Path, *, on_device: bool) -> None:
-    source = PatchSource.read(data)
+def test_paths_are_taken_up_before_their_start_too(*, on_device: bool) -> None:
+    source = PatchSource([[sphere(20_000).astype(np.float32)]])
     batch = drawn(source, 64, on_device=on_device)
     assert EARLIEST <= batch.time.min() < 0.7 * EARLIEST
     assert 0.9 < batch.time.max() < 1
@@ -109,6 +110,18 @@ def test_half_of_the_patches_are_in_the_sizes_of_a_first_pass(*, on_device: bool
     larger = here.norm(dim=2).quantile(0.9, dim=1) / 0.18
     assert 0.1 < (larger > 1.4).float().mean() < 0.5
     assert 0.15 < (time < 0).float().mean() < 0.5  # first passes alone have more than NOISE_STD
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_patches_of_few_points_are_shown_no_larger_than_the_filter_shows_them(*, on_device: bool) -> None:
+    # 1000 of these 1500 points reach around most of the sphere, up to 1.63 radii from the seed.
+    few, many = sphere(1500).astype(np.float32), sphere(20_000).astype(np.float32)
+    batch = drawn(PatchSource([[few]]), 64, on_device=on_device)
+    reach = batch.clean.norm(dim=2).amax(dim=1)
+    assert (reach < 1.1 * LARGEST_RADIUS * SCALES[1]).all()
+    assert (reach > 0.9 * LARGEST_RADIUS * SCALES[0]).all()
+    beside = drawn(PatchSource([[few], [many]]), 64, on_device=on_device)
+    assert torch.isfinite(beside.at(beside.time)).all()
 
 
 def test_one_pass_is_asked_to_go_no_farther_than_it_can() -> None:
