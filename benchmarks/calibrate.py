@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import errors_in_one_line, noise_level
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
@@ -34,6 +35,7 @@ from straightpcf.model.train.state import average_with, read_network, take_dista
 _TABLE_CLOUDS, _TABLE_EVERY = "50000", 5
 
 
+@errors_in_one_line()
 def main() -> None:
     """Print both tables; with --out write the weights."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -50,7 +52,7 @@ def main() -> None:
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
     )
     parser.add_argument("--traces", type=Path, help="keep what was measured here, and use what is there")
-    parser.add_argument("--noise", type=float, nargs="+", default=NOISE_LEVELS)
+    parser.add_argument("--noise", type=noise_level, nargs="+", default=NOISE_LEVELS)
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)

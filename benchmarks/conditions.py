@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.passes import Truth
 from benchmarks.shapes import ANALYTIC, analytic
 from straightpcf.model.filter import Filter, load_filter
@@ -41,6 +42,7 @@ class Condition:
 Make = Callable[[np.random.Generator, Floats], Condition]
 
 
+@errors_in_one_line()
 def main() -> None:
     """Print a line for each shape, condition and seed, then each condition's means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import errors_in_one_line, noise_level
 from benchmarks.passes import Truth
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
@@ -30,6 +31,7 @@ from straightpcf.model.train.state import read_network, take_distance_module
 from straightpcf.points.options import DenoiseOptions
 
 
+@errors_in_one_line()
 def main() -> None:
     """Print a line for each candidate, level and seed, then its means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -38,7 +40,7 @@ def main() -> None:
     parser.add_argument("--unseen", type=Path, action="append", default=[])
     parser.add_argument("--shapes", nargs="+", help="default: all that are held out or unseen")
     parser.add_argument("--resolution", type=int, default=10000)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.02, 0.03])
+    parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.02, 0.03])
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument(
         "--seeds", type=int, nargs="+", default=[0, 1], help="of the noise; one is too little to judge by"

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from benchmarks.command import errors_in_one_line, noise_level
 from benchmarks.quality import SHARED
 from benchmarks.shapes import make_noise
 from straightpcf.model.filter import Filter
@@ -74,12 +75,13 @@ class Truth:
         return 1e4 * chamfer_distance(xyz, self.clean), float(1e4 * np.mean(height**2)), float(1e4 * sunk)
 
 
+@errors_in_one_line()
 def main() -> None:
     """Print a row for each state, noise and pass."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("states", type=Path, nargs="+")
     parser.add_argument("--distance", type=Path, help="the state whose DistanceModule to take")
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.01, 0.02])
+    parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.01, 0.02])
     parser.add_argument("--passes", type=int, default=4)
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument("--threads", type=int)

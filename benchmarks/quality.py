@@ -21,6 +21,7 @@ import torch
 from safetensors import safe_open
 from torch import nn
 
+from benchmarks.command import errors_in_one_line, noise_level
 from benchmarks.conventional import jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
@@ -66,6 +67,7 @@ class Row:
     every: tuple[tuple[float, float], ...] = ()
 
 
+@errors_in_one_line()
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(arguments)
@@ -229,7 +231,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--split", choices=("punet", "validation"), default="punet")
     parser.add_argument("--resolution", type=int, nargs="+", default=[10000])
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.01, 0.02, 0.03], help="in unit-sphere radii")
+    parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.01, 0.02, 0.03], help="in unit-sphere radii")
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument(
         "--iterations",

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.quality import SHARED
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import StraightPCFError
@@ -29,6 +30,7 @@ MEASURED_POINTS = 20_000
 CROP_POINTS = 3000
 
 
+@errors_in_one_line()
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; exit with 1 if any scan came back wrong."""
     options = _parser().parse_args(arguments)

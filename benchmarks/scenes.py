@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import errors_in_one_line, noise_level
 from straightpcf.model.filter import load_filter
 from straightpcf.points.options import DenoiseOptions
 
@@ -293,6 +294,7 @@ def distance_to(parts: list[Part], xyz: Floats) -> Floats:
     return nearest
 
 
+@errors_in_one_line()
 def main(arguments: list[str] | None = None) -> None:
     """Filter the scans and print what is left."""
     parser = _parser()
@@ -339,7 +341,7 @@ def _rms(distances: Floats) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description="Filter scenes that are known exactly.")
     parser.add_argument("scanners", nargs="*", metavar="SCANNER", help=f"of {', '.join(SCANNERS)}; default: all")
-    parser.add_argument("--noise", type=float, default=1.0, help="times each scanner's own")
+    parser.add_argument("--noise", type=noise_level, default=1.0, help="times each scanner's own")
     parser.add_argument("--iterations", default="auto")
     parser.add_argument("--every", type=int, default=1, help="take each n-th point only")
     parser.add_argument("--weights", type=Path, help="default: the shipped ones")

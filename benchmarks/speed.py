@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.quality import SHARED
 from benchmarks.shapes import Shape, analytic, make_noise, punet
 from straightpcf.model.cpus import usable_cpus
@@ -57,6 +58,7 @@ class Timing:
 _R = TypeVar("_R")
 
 
+@errors_in_one_line()
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(arguments)

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.quality import SHARED
 from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.train.data import NOISE_STD, Batch, PatchSource
@@ -58,6 +59,7 @@ def _normals(clean: torch.Tensor) -> torch.Tensor:
     return normals
 
 
+@errors_in_one_line()
 def main() -> None:
     """Print one block for each state."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

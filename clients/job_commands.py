@@ -49,7 +49,7 @@ def connect(url: str, api_key: str | None) -> Iterator[Client]:
 
 
 def submit(
-    sources: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The noisy clouds; - for stdin.")],
+    sources: Annotated[list[Path], typer.Argument(metavar="FILE", help="The noisy clouds; - for stdin.")],
     iterations: Iterations = "auto",
     seed: Seed = 0,
     strength: Strength = 1.0,
@@ -101,7 +101,7 @@ def wait(
 
 
 def cancel(
-    ids: Annotated[list[str], typer.Argument(metavar="ID...")],
+    ids: Annotated[list[str], typer.Argument(metavar="ID")],
     url: Url = DEFAULT_URL,
     api_key: Key = None,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import torch
 
 from benchmarks import scenes
+from benchmarks.command import noise_level
 from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
 from straightpcf.model.kernels import cpu
@@ -22,7 +24,13 @@ ROOT = Path(__file__).parent.parent
 
 
 def printed(name: str, *arguments: object) -> str:
-    ended = subprocess.run(
+    ended = _run(name, *arguments)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def _run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, "-m", f"benchmarks.{name}", *map(str, arguments)],
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
@@ -31,8 +39,6 @@ def printed(name: str, *arguments: object) -> str:
         timeout=120,
         check=False,
     )
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
 
 
 def test_quality(tmp_path: Path) -> None:
@@ -149,3 +155,23 @@ def test_candidates_are_compared_on_what_is_held_out(tmp_path: Path) -> None:
         assert 0 < height < 4  # the noise's own is 4
         assert chamfer > height
     assert all(more >= less - 0.001 for less, more in zip(geometric, arithmetic, strict=True))
+
+
+@pytest.mark.parametrize("name", ["held_out", "passes", "velocities", "quality", "calibrate"])
+def test_a_file_that_is_missing_is_named_in_one_line(name: str, tmp_path: Path) -> None:
+    gone = tmp_path / "gone.safetensors"
+    options: dict[str, tuple[object, ...]] = {
+        "calibrate": ("--state", gone),
+        "quality": ("--split", "validation", "--weights", gone),
+    }
+    ended = _run(name, *options.get(name, (gone, "--data", tmp_path / "gone.npz")))
+    assert ended.returncode == 1
+    (line,) = ended.stderr.splitlines()
+    assert str(tmp_path) in line
+
+
+def test_noise_that_is_no_number_is_a_usage_error() -> None:
+    for text in ("nan", "inf", "-0.01"):
+        with pytest.raises(argparse.ArgumentTypeError, match=text):
+            noise_level(text)
+    assert noise_level("0.02") == 0.02

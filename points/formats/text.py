@@ -6,6 +6,7 @@ between the replaced tokens is copied byte for byte.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -264,6 +265,8 @@ def shown(token: bytes) -> str:
 
 def refuse_binary(raw: bytes, begin: int) -> None:
     """Raise MalformedFile where a text file holds a zero byte."""
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise MalformedFile("the file is UTF-16 text: save it as UTF-8")
     at = raw.find(b"\0", begin)
     if at >= 0:
         raise MalformedFile(f"byte {at} is 0x00: this is no text file")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,7 +195,8 @@ def _table(
                 parts[column].append(_whole(table, token, values) if has_ids else values)
             elif column in layout.axes:
                 text = raw[begins[bad] : stops[bad]]
-                raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number")
+                hint = "; decimals have a point here, no comma" if _has_decimal_comma(text, layout.delimiter) else ""
+                raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number{hint}")
             else:
                 texts.append(column)  # it stays in the file
                 del parts[column]
@@ -206,6 +208,11 @@ def _table(
     there = {*layout.axes} | ({*parts} - unsaid)
     columns = {column: _joined(values) for column, values in parts.items() if column in there}
     return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
+
+
+def _has_decimal_comma(text: bytes, delimiter: bytes | None) -> bool:
+    """Say whether a cell looks like 0,5, or, where commas were taken for delimiters, like what is between two such."""
+    return re.fullmatch(rb"\d+\s+[+-]?\d+" if delimiter == b"," else rb"[+-]?\d+,\d+", text) is not None
 
 
 def _refuse_counted(columns: Mapping[int, npt.NDArray[Any]], line: int) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,48 +11,11 @@ import httpx2
 import numpy as np
 import pytest
 
-from straightpcf.points.formats import format_named, read_cloud
-from tests.clouds import noisy, sphere, torus
+from straightpcf.points.formats import read_cloud
+from tests.clouds import noisy, sphere
 from tests.conftest import RunningServer
-from tests.points.test_xyz import MALFORMED, TABBED, TABLES
+from tests.e2e.conftest import POINTS
 from tests.waiting import wait_for
-
-POINTS = 2500
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-POSITIONS = "async ([b, name]) => [...(await import('/static/read/index.js')).readPositions(new Uint8Array(b), name)]"
-_UNANSWERED = "Failed to load resource: net::ERR_"
-FLAGS = (
-    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync",
-    "--disable-component-update", "--use-gl=swiftshader", "--enable-unsafe-swiftshader",
-)  # fmt: skip
-
-
-@pytest.fixture
-def page(server: RunningServer) -> Iterator[Any]:
-    """The page, loaded; fails the test on any error in its console."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here: apt-get install chromium")
-    with playwright.sync_playwright() as browsers:
-        browser = browsers.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": 1200, "height": 800})
-        errors: list[str] = []
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        # A refused request is an error to the console, and what this page is there to explain.
-        page.on("console", lambda said: errors.append(said.text) if _is_fault(said) else None)
-        page.goto(server.url)
-        yield page
-        browser.close()
-        assert not errors
-
-
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
-    xyz = noisy(torus(POINTS), 0.01).astype("<f4")
-    kinds = "".join(f"property float {name}\n" for name in "xyz")
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {POINTS}\n{kinds}end_header\n"
-    (path := tmp_path / "scan.ply").write_bytes(head.encode() + xyz.tobytes())
-    return path
 
 
 def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path: Path) -> None:
@@ -161,6 +122,33 @@ def test_no_job_is_left_of_what_was_sent_without_an_answer(
     wait_for(lambda: page.wait_for_timeout(50) or deleted[-1] == 204)
     assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
     assert ("does not answer" in page.inner_text("#error")) == (how == "cut off")
+
+
+def test_the_keyboard_alone_does_it_and_the_focus_is_never_lost(page: Any, scan: Path, tmp_path: Path) -> None:
+    focused = "document.activeElement.id"
+    np.save(large := tmp_path / "large.npy", noisy(sphere(40_000), 0.01))
+    page.set_input_files("#file", large)
+    page.focus("#submit")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#status:has-text('Pass')")
+    assert page.evaluate(focused) == "submit"
+    page.keyboard.press("Enter")  # another time sends nothing
+    page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "cancel"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#cancel", state="hidden")
+    assert page.evaluate(focused) == "submit"
+    assert page.locator("#jobs-list li").count() == 1
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    for at, then in ("submit", "report-title"), ("canvas", "canvas"):
+        page.focus("#submit")
+        page.keyboard.press("Enter")
+        page.focus(f"#{at}")
+        page.wait_for_selector("#cancel:not([hidden])")
+        page.wait_for_selector("#cancel", state="hidden")
+        assert page.is_visible("#report")
+        assert page.evaluate(focused) == then
 
 
 def test_what_is_shown_before_a_result_is_of_the_file_that_was_sent(page: Any, scan: Path, tmp_path: Path) -> None:
@@ -280,62 +268,6 @@ def test_an_answer_of_a_proxy_that_wants_a_login_is_explained(page: Any, scan: P
     page.wait_for_selector("#error:has-text('log in')")
 
 
-def test_the_page_reads_text_tables_as_the_server_does(page: Any) -> None:
-    read = "async (bytes) => [...(await import('/static/read/xyz.js')).readXyz(new Uint8Array(bytes))]"
-    for case, raw in TABLES.items():
-        assert page.evaluate(read, list(raw)) == [1, 2, 3, 4, 5, 6], case
-
-
-def test_the_page_reads_every_suffix_of_text_tables(page: Any) -> None:
-    for suffix in (suffix for name in ("xyz", "csv", "tsv", "pts") for suffix in format_named(name).suffixes):
-        assert page.evaluate(POSITIONS, [list(b"1 2 3\n4 5 6\n"), f"A{suffix.upper()}"]) == [1, 2, 3, 4, 5, 6], suffix
-        assert page.evaluate("async (n) => (await import('/static/read/reader.js')).canRead(n, 9)", f"a{suffix}"), (
-            suffix
-        )
-
-
-def test_the_page_splits_a_tsv_at_its_tabs_as_the_server_does(page: Any) -> None:
-    for case, raw in (TABBED | TABLES).items():
-        assert page.evaluate(POSITIONS, [list(raw), "a.tsv"]) == [1, 2, 3, 4, 5, 6], case
-    gaps = page.evaluate(POSITIONS, [list(b"x\ty\tz\n1\t2\t3\n\t\t\n4\t\t6\n"), "a.tsv"])
-    np.testing.assert_array_equal(np.array(gaps, np.float64), [1, 2, 3, np.nan, np.nan, np.nan, 4, np.nan, 6])
-
-
-def test_the_page_reads_a_ply_with_capital_axes(page: Any, scan: Path, tmp_path: Path) -> None:
-    for axis in b"xyz":
-        scan.write_bytes(scan.read_bytes().replace(b"float %c\n" % axis, b"float %c\n" % (axis - 32)))
-    read = page.evaluate(POSITIONS, [list(scan.read_bytes()), "a.ply"])
-    np.testing.assert_array_equal(np.reshape(read, (-1, 3)), read_cloud(scan)[0].xyz)
-
-
-@pytest.mark.parametrize("separator", [" ", ",", "\t"])
-def test_the_page_refuses_a_first_column_that_counts_the_points_as_the_server_does(page: Any, separator: str) -> None:
-    said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031
-    name = "a.tsv" if separator == "\t" else "a.txt"
-
-    def answer(rows: list[str], above: str = "") -> Any:
-        raw = "\n".join([above, *rows]).replace(" ", separator).encode()
-        return page.evaluate(said, [list(raw), name])
-
-    counted = [f"{n} {n % 7}.5 2 3.25 tree" for n in range(1, 51)]
-    assert "counts the points" in answer(counted)
-    assert answer(counted, "id x y z code") == 150
-    assert answer([f"{n} 0 1" for n in range(50)]) == 150
-    assert answer([f"{n} 0 1 oak" for n in range(50)]) == 150
-    assert answer([f"{n % 10} {n // 10} 1 7" for n in range(50)]) == 150
-    assert answer([f"{n + 0.5} 0 1 7" for n in range(50)]) == 150
-    assert answer([f"{n} 0 1 7" for n in range(9)]) == 27
-    assert answer([f"{2 * n} 0 1 7" for n in range(50)]) == 150
-
-
-def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
-    """Rather no picture of what was sent than one of other columns."""
-    read = "async (b) => (await import('/static/read/xyz.js')).readXyz(new Uint8Array(b))"
-    said = "async (b) => { try { await (%s)(b) } catch (error) { return error.message } }" % read  # noqa: UP031
-    for case in (case for case, (_, pattern) in MALFORMED.items() if "name" in pattern):
-        assert page.evaluate(said, list(MALFORMED[case][0])) == "names that do not say x, y, z", case
-
-
 def test_lengths_are_written_as_people_read_them(page: Any) -> None:
     values = [0, 2.5e-16, 0.00012345, 0.5, 9.996, 12.345, 999.7, 1234.4, -98765.4, 5.4e6, None]
     said = ["0", "2.50e-16", "0.000123", "0.5", "10", "12.3", "1,000", "1,234", "-98,765", "5.40e+6", "unknown"]
@@ -379,12 +311,6 @@ def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
     page.wait_for_timeout(500)  # a frame or two of the viewer
     lowest = (0x44 / 255, 0x01 / 255, 0x54 / 255)  # which fades with depth
     assert (np.abs(_picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
-
-
-def _is_fault(said: Any) -> bool:
-    if said.type != "error" or "/static/" in said.location.get("url", ""):
-        return bool(said.type == "error")
-    return not said.text.startswith(("Failed to load resource: the server responded with a status of 4", _UNANSWERED))
 
 
 def _picture(page: Any) -> np.ndarray:

@@ -326,7 +326,10 @@ MALFORMED = {
     "more names than columns": (b"a b id x y z\n1 2 3 4\n", r"line 1 names 6 or more columns.*line 2 has 4"),
     "a cell less than names": (b"id\tcode\tx\ty\tz\n1\t\t2\t3\t4\n", r"line 1 names 5 .*line 2 has 4"),
     "binary": (b"1 2 3\n\x00\x01\x02", r"0x00"),
-    "UTF-16": ("1 2 3\n".encode("utf-16"), r"0x00"),
+    "UTF-16": ("1 2 3\n".encode("utf-16"), r"UTF-16.*UTF-8"),
+    "decimal commas": (b"1 2 3\n0,5 -1,5 2,5\n", r"line 2"),
+    "decimal commas only": (b"0,5 -1,5 2,5\n" * 2, r"line 1, column 2: '5 -1' is no number; decimals have a point"),
+    "decimal commas between semicolons": (b"x;y;z\n0,5;1,5;2\n", r"line 2, column 1: '0,5'.*decimals have a point"),
 }
 
 

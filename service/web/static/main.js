@@ -23,7 +23,7 @@ let shown = null; // the id of the job whose result is shown
 
 parts.form.addEventListener("submit", (event) => {
   event.preventDefault();
-  send().catch(showProblem);
+  if (!run) send().catch(showProblem);
 });
 parts.cancel.addEventListener("click", () => cancel().catch(showProblem));
 parts.key.addEventListener("change", takeKey);
@@ -138,7 +138,7 @@ async function follow(id, before, signal) {
     offerDownload(parts.download, job, showProblem);
     parts.report.hidden = false;
     shown = id;
-    parts["report-title"].focus({ preventScroll: true });
+    if (isWaiting()) parts["report-title"].focus({ preventScroll: true });
   } else {
     parts.progress.hidden = true;
     if (job.state === "canceled") {
@@ -150,6 +150,12 @@ async function follow(id, before, signal) {
       stage.note(`The job is ${job.state}.`);
     }
   }
+}
+
+// Whoever is at other controls meanwhile is not taken away from them.
+function isWaiting() {
+  const { activeElement } = document;
+  return activeElement === document.body || activeElement.closest(".actions") !== null;
 }
 
 function hideResult() {
@@ -248,7 +254,8 @@ function speak(line) {
 }
 
 function busy(isBusy) {
-  parts.submit.disabled = isBusy;
+  parts.submit.setAttribute("aria-disabled", isBusy); // `disabled` would lose the focus, as would what is hidden
+  if (!isBusy && document.activeElement === parts.cancel) parts.submit.focus();
   parts.cancel.hidden = !isBusy;
 }
 
