@@ -188,7 +188,11 @@ def _check_start(settings: Settings) -> None:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
         raise InvalidOptions(f"weights is {settings.weights}, which is no file")
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        family = socket.getaddrinfo(settings.host or "0.0.0.0", 0, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((settings.host, 0), family=family).close()
+    except (OSError, UnicodeError) as exc:
+        raise InvalidOptions(f"host is {settings.host[:80]!r}, where this machine cannot listen: {exc}") from exc
     for name in ("port", "grpc_port"):
         if port := getattr(settings, name):
             try:
