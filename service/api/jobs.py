@@ -64,6 +64,8 @@ async def put_job(id: str, request: Request, owner: Owner) -> Response:
 
 
 @router.head("/jobs", include_in_schema=False)
+@router.head("/jobs/", include_in_schema=False)
+@router.get("/jobs/", include_in_schema=False)
 @router.get("/jobs", response_model=JobPage, responses=problems(400, 401), summary="List jobs")
 async def list_jobs(
     request: Request,
