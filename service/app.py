@@ -165,7 +165,7 @@ def _end_well(number: int, frame: FrameType | None) -> None:
 
 
 def _quiet_when_cut_off(app: ASGIApp) -> ASGIApp:
-    """Show no traceback of a request that is not over when the server ends; uvicorn says in a line how many they are."""
+    """Show no traceback of a request that is cut off when the server ends; uvicorn says in a line how many they are."""
 
     async def quiet(scope: Scope, receive: Receive, send: Send) -> None:
         try:

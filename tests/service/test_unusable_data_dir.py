@@ -59,7 +59,7 @@ def test_who_asks_is_told_so_and_served_when_it_is_over(
 
     async def scenario() -> None:
         async with (
-            serving(tmp_path / "data", backend) as (engine, host, port),
+            serving(tmp_path / "data", backend) as (_, host, port),
             httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
         ):
             backend.finish.clear()
