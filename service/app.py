@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import signal
 import socket
 import sqlite3
+import sys
 import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -16,6 +19,7 @@ from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 import straightpcf
 from straightpcf.points.errors import InvalidOptions, MissingDependency, SpoolFull
@@ -109,7 +113,7 @@ def serve(settings: Settings) -> None:
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
     config = uvicorn.Config(
-        app,
+        _quiet_when_cut_off(app),
         host=settings.host,
         port=settings.port,
         timeout_graceful_shutdown=settings.shutdown_seconds,
@@ -129,6 +133,7 @@ def serve(settings: Settings) -> None:
             settings.host,
         )
     _check_start(settings)
+    signal.signal(signal.SIGTERM, _end_well)  # uvicorn raises it anew when all is over
     server.run()
     if backend.failure is not None:
         raise backend.failure
@@ -153,6 +158,23 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
         if self.force_exit and not self.lifespan.shutdown_event.is_set():
             await self.lifespan.shutdown()
+
+
+def _end_well(number: int, frame: FrameType | None) -> None:
+    sys.exit(0)
+
+
+def _quiet_when_cut_off(app: ASGIApp) -> ASGIApp:
+    """Show no traceback of a request that is cut off when the server ends; uvicorn says in a line how many they are."""
+
+    async def quiet(scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await app(scope, receive, send)
+        except asyncio.CancelledError:
+            if scope["type"] != "http":
+                raise
+
+    return quiet
 
 
 def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Telemetry) -> GrpcServer | None:
@@ -188,7 +210,11 @@ def _check_start(settings: Settings) -> None:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
         raise InvalidOptions(f"weights is {settings.weights}, which is no file")
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        family = socket.getaddrinfo(settings.host or "0.0.0.0", 0, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((settings.host, 0), family=family).close()
+    except (OSError, UnicodeError) as exc:
+        raise InvalidOptions(f"host is {settings.host[:80]!r}, where this machine cannot listen: {exc}") from exc
     for name in ("port", "grpc_port"):
         if port := getattr(settings, name):
             try:

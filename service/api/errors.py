@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import sqlite3
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -112,6 +113,13 @@ GRPC_STATUS_BY_CODE: Mapping[str, str] = {
 _KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 _USED_UP = frozenset({errno.EMFILE, errno.ENFILE})
+_UNUSABLE = frozenset(
+    {errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR, errno.EIO, errno.ESTALE, errno.ENODEV}
+)
+_SQLITE_UNUSABLE = frozenset(
+    {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN}
+)
+_PRIMARY = 0xFF  # of SQLite's codes: the other bits say more
 
 logger = logging.getLogger("uvicorn.error")
 
@@ -123,6 +131,7 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _validation)
     app.add_exception_handler(ClientDisconnect, _nobody_listens)
     app.add_exception_handler(OSError, _system)
+    app.add_exception_handler(sqlite3.Error, _system)
     app.add_exception_handler(Exception, _unforeseen)
 
 
@@ -161,17 +170,28 @@ async def _nobody_listens(request: Request, error: Exception) -> Response:
 
 
 async def _system(request: Request, error: Exception) -> Response:
-    if not isinstance(error, OSError) or (passing := busy(error)) is None:
+    if not isinstance(error, OSError | sqlite3.Error) or (passing := busy(error)) is None:
         raise error  # to _unforeseen, and into the log
     return await _ours(request, passing)
 
 
-def busy(error: OSError) -> ServerBusy | None:
-    """Return what to say of an error that passes as soon as other requests let go of their files."""
-    if error.errno not in _USED_UP:
+def busy(error: OSError | sqlite3.Error) -> ServerBusy | None:
+    """Return what to say of an error that passes: others let go of their files, or an operator mends the disk."""
+    if isinstance(error, OSError) and error.errno in _USED_UP:
+        told = "the server has no file descriptor left for this request"
+    elif _is_unusable(error):
+        told = "the server's data directory cannot be used at the moment; its log says why"
+    else:
         return None
     logger.warning("a request is sent away: %s", error)
-    return ServerBusy("the server has no file descriptor left for this request")
+    return ServerBusy(told)
+
+
+def _is_unusable(error: OSError | sqlite3.Error) -> bool:
+    """Tell whether it came of a data directory that is gone or read-only, or of a file that another process locks."""
+    if isinstance(error, OSError):
+        return error.errno in _UNUSABLE
+    return getattr(error, "sqlite_errorcode", 0) & _PRIMARY in _SQLITE_UNUSABLE
 
 
 async def _unforeseen(request: Request, error: Exception) -> Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import sqlite3
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -82,7 +83,7 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
 def _explained(fault: Exception) -> StraightPCFError | None:
     if isinstance(fault, DecodeError):
         return InvalidRequest(f"a message of the call is none of this service's schema: {fault}")
-    return busy(fault) if isinstance(fault, OSError) else None
+    return busy(fault) if isinstance(fault, OSError | sqlite3.Error) else None
 
 
 async def _abort(context: Context, error: StraightPCFError, request_id: str) -> Never:

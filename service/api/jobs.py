@@ -18,9 +18,11 @@ from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.openapi import (
     EVENTS_PARAMETERS,
     EVENTS_RESPONSES,
+    HEAD_RESULT_RESPONSES,
     JOB_BODY,
     JOB_PARAMETERS,
     JOB_RESPONSES,
+    PUT_JOB_RESPONSES,
     RESULT_PARAMETERS,
     RESULT_RESPONSES,
     STREAM_RESPONSES,
@@ -54,7 +56,7 @@ async def create_job(request: Request, owner: Owner) -> Response:
 
 
 @router.put(
-    "/jobs/{id}", status_code=202, response_model=Job, responses={**JOB_RESPONSES, **problems(404)},
+    "/jobs/{id}", status_code=202, response_model=Job, responses=PUT_JOB_RESPONSES,
     summary="Make a job with a chosen id", openapi_extra={"requestBody": JOB_BODY, "parameters": JOB_PARAMETERS},
 )  # fmt: skip
 async def put_job(id: str, request: Request, owner: Owner) -> Response:
@@ -64,6 +66,8 @@ async def put_job(id: str, request: Request, owner: Owner) -> Response:
 
 
 @router.head("/jobs", include_in_schema=False)
+@router.head("/jobs/", include_in_schema=False)
+@router.get("/jobs/", include_in_schema=False)
 @router.get("/jobs", response_model=JobPage, responses=problems(400, 401), summary="List jobs")
 async def list_jobs(
     request: Request,
@@ -79,7 +83,7 @@ async def list_jobs(
 
 
 @router.head("/jobs/{id}", include_in_schema=False)
-@router.get("/jobs/{id}", response_model=Job, responses=problems(400, 401, 404, 503), summary="Look at a job")
+@router.get("/jobs/{id}", response_model=Job, responses=problems(401, 404), summary="Look at a job")
 async def get_job(
     id: str,
     request: Request,
@@ -145,16 +149,21 @@ async def _result(id: str, request: Request, owner: Owner) -> Response:
 
 
 _RESULT: dict[str, Any] = {
-    "response_class": Response, "responses": RESULT_RESPONSES, "openapi_extra": {"parameters": RESULT_PARAMETERS},
+    "response_class": Response, "openapi_extra": {"parameters": RESULT_PARAMETERS},
 }  # fmt: skip
-router.get("/jobs/{id}/result", summary="Fetch the result", operation_id="get_result", **_RESULT)(_result)
-router.head("/jobs/{id}/result", summary="Ask about the result", operation_id="head_result", **_RESULT)(_result)
+router.get(
+    "/jobs/{id}/result", summary="Fetch the result", operation_id="get_result", responses=RESULT_RESPONSES, **_RESULT
+)(_result)
+router.head(
+    "/jobs/{id}/result", summary="Ask about the result", operation_id="head_result", responses=HEAD_RESULT_RESPONSES,
+    **_RESULT,
+)(_result)  # fmt: skip
 
 
 @router.head("/jobs/{id}/report", include_in_schema=False)
 @router.get(
     "/jobs/{id}/report", response_model=Report, summary="The report",
-    responses=problems(401, 404, 409, 410, 413, 415, 500, 507),
+    responses=problems(401, 404, 409, 410, 413, 415, 507),
 )  # fmt: skip
 async def job_report(id: str, request: Request, owner: Owner) -> Report:
     """Show displacement, noise before and after, passes, timings and warnings."""

@@ -17,10 +17,13 @@ __all__ = [
     "DENOISE_RESPONSES",
     "EVENTS_PARAMETERS",
     "EVENTS_RESPONSES",
+    "HEAD_RESULT_RESPONSES",
     "JOB_BODY",
     "JOB_PARAMETERS",
     "JOB_RESPONSES",
+    "MISDIRECTED",
     "PATH_PARAMETER",
+    "PUT_JOB_RESPONSES",
     "RESULT_PARAMETERS",
     "RESULT_RESPONSES",
     "STREAM_RESPONSES",
@@ -163,7 +166,7 @@ def _form_body(fields: dict[str, dict[str, Any]]) -> dict[str, Any]:
 JOB_BODY = _form_body(_OPTIONS)
 DENOISE_FORM_BODY = _form_body({**_OPTIONS, "report": _REPORT})
 
-_RESULT_HEADERS = {
+_HEADERS = {
     "X-Request-Id": ("The id of this request, also in every problem.", "string", "8b1e6f0a5d9c4c2f9a53d8f6f3f6a2d1"),
     "X-Job-Id": ("The job that made it.", "string", "c53b6bb26ca24d55af66ff11d0fa5dea"),
     "X-Points": ("Points in, and points out.", "integer", 10000),
@@ -174,20 +177,38 @@ _RESULT_HEADERS = {
     "Content-Disposition": ("The name of the result.", "string", 'attachment; filename="scan_clean.ply"'),
     "ETag": ("The sha256 of the result in hex.", "string", f'"{_SHA256}"'),
     "Repr-Digest": ("The same as RFC 9530 has it.", "string", "sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"),
+    "Cache-Control": ("Ask before it is used again.", "string", "private, no-cache"),
+    "Content-Range": ("Which part it is; of 416: how large the result is.", "string", "bytes 0-65535/240128"),
+    "Location": ("Where the job is.", "string", "/jobs/c53b6bb26ca24d55af66ff11d0fa5dea"),
+    "Preference-Applied": ("What of `Prefer` was heeded, if anything.", "string", "respond-async"),
+    "Retry-After": ("After how many seconds to try again, where that may help.", "integer", 2),
+    "WWW-Authenticate": ("How to say the key.", "string", "Bearer"),
 }
-_FILE: dict[str, Any] = {
-    "content": {"application/octet-stream": _RAW},
-    "headers": {
-        name: {"description": description, "schema": {"type": kind}, "example": example}
-        for name, (description, kind, example) in _RESULT_HEADERS.items()
-    },
+_OF_FILE = ("X-Request-Id", "X-Job-Id", "X-Points", "X-Iterations", "X-Noise-Before", "X-Noise-After", "X-Untouched")
+_OF_RESULT = (*_OF_FILE, "Content-Disposition", "ETag", "Repr-Digest", "Cache-Control")
+_OF_PROBLEM = {401: ("WWW-Authenticate",), 416: ("Content-Range",)} | {
+    status: ("Retry-After",) for status in (408, 429, 503, 507)
 }
+_TEXT: dict[str, Any] = {"schema": {"type": "string"}}
+_FILE_CONTENT = {format.media_type: _RAW for format in FORMATS}
 
 
-def _problem(description: str) -> dict[str, Any]:
+def _headers(*names: str) -> dict[str, Any]:
     return {
-        "description": description,
+        name: {"description": description, "schema": {"type": kind}, "example": example}
+        for name, (description, kind, example) in _HEADERS.items()
+        if name in names
+    }
+
+
+_FILE: dict[str, Any] = {"content": _FILE_CONTENT, "headers": _headers(*_OF_RESULT)}
+
+
+def _problem(status: int) -> dict[str, Any]:
+    return {
+        "description": _PROBLEMS[status],
         "content": {"application/problem+json": {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}},
+        "headers": _headers("X-Request-Id", *_OF_PROBLEM.get(status, ())),
     }
 
 
@@ -213,9 +234,13 @@ _PROBLEMS = {
 }
 
 
+MISDIRECTED: dict[int | str, dict[str, Any]] = {421: _problem(421)}  # of what asks for no key
+_ANYWHERE = (421, 422, 429, 500, 503)
+
+
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe problems by status."""
-    return {status: _problem(_PROBLEMS[status]) for status in sorted({*statuses, 421, 422, 429})}
+    return {status: _problem(status) for status in sorted({*statuses, *_ANYWHERE})}
 
 
 def document_problems(app: FastAPI) -> None:
@@ -230,22 +255,23 @@ def document_problems(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-_INTAKE = (400, 401, 403, 408, 409, 413, 415, 422, 429, 500, 503, 507)
+_INTAKE = (400, 401, 403, 408, 413, 415, 507)
 _JOB: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/components/schemas/Job"}}}
-_LOCATION = {"Location": {"description": "Where the job is.", "schema": {"type": "string"}}}
+_LOCATION = _headers("Location")
 
 
 DENOISE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The cloud, in the requested format.",
-        **_FILE,
+        "description": "The cloud, in the requested format; with `report` the report before it; or the job's events.",
+        "content": {**_FILE_CONTENT, "multipart/mixed": _RAW, "text/event-stream": _TEXT},
+        "headers": _headers(*_OF_RESULT, "Location", "Preference-Applied"),
     },
     202: {
         "description": "The job, if it was preferred so, took longer than this server lets a request wait, or it ends.",
         "content": _JOB,
-        "headers": _LOCATION,
+        "headers": _headers("Location", "Preference-Applied"),
     },
-    **problems(*_INTAKE, 404, 410),
+    **problems(*_INTAKE, 404, 409, 410),
 }
 
 JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -253,18 +279,24 @@ JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
     202: {"description": "It waits for a worker.", "headers": _LOCATION},
     **problems(*_INTAKE),
 }
+PUT_JOB_RESPONSES = {**JOB_RESPONSES, **problems(404, 409)}
 
 RESULT_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"description": "The cloud.", **_FILE},
-    206: {"description": "The part that was asked for.", **_FILE},
-    304: {"description": "What If-None-Match names is still the result."},
-    **problems(400, 401, 404, 409, 410, 412, 413, 415, 416, 500, 503, 507),
+    206: {
+        "description": "The part that was asked for, or several.",
+        "content": {**_FILE_CONTENT, "multipart/byteranges": _RAW},
+        "headers": _headers(*_OF_RESULT, "Content-Range"),
+    },
+    304: {"description": "What If-None-Match names is still the result.", "headers": _headers("ETag", "Cache-Control")},
+    **problems(401, 404, 409, 410, 412, 413, 415, 416, 507),
 }
+HEAD_RESULT_RESPONSES = {status: said for status, said in RESULT_RESPONSES.items() if status not in (206, 416)}
 
 EVENTS_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Events `queued start progress preview output log completed`; docs/api.md says what is in each.",
-        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        "content": {"text/event-stream": _TEXT},
     },
     204: {"description": "It is finished, and nothing happened behind `Last-Event-ID`."},
     **problems(400, 401, 404),
@@ -275,8 +307,8 @@ STREAM_RESPONSES: dict[int | str, dict[str, Any]] = {
         "description": "Finished patches, framed as in docs/api.md.",
         "content": {
             "application/vnd.straightpcf.patches": _RAW,
-            "application/x-ndjson": {"schema": {"type": "string"}},
+            "application/x-ndjson": _TEXT,
         },
     },
-    **problems(400, 401, 404, 409, 410, 413, 415, 500, 507),
+    **problems(400, 401, 404, 409, 410, 413, 415, 507),
 }

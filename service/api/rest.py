@@ -23,6 +23,7 @@ from straightpcf.service.api.openapi import (
     DENOISE_FORM_BODY,
     DENOISE_PARAMETERS,
     DENOISE_RESPONSES,
+    MISDIRECTED,
     PATH_PARAMETER,
     problems,
 )
@@ -105,15 +106,17 @@ async def denoise(request: Request, owner: Owner) -> Response:
 # Load balancers ask with HEAD.
 @router.head("/healthz", include_in_schema=False)
 @router.head("/livez", include_in_schema=False)
-@router.get("/healthz", summary="Is the server there")
-@router.get("/livez", summary="Is the server there", operation_id="livez")
+@router.get("/healthz", summary="Is the server there", responses=MISDIRECTED)
+@router.get("/livez", summary="Is the server there", operation_id="livez", responses=MISDIRECTED)
 async def health(request: Request) -> Health:
     """Answer as long as the process lives, however busy the workers are."""
     return Health(status="ok", ready=request.app.state.engine.ready)
 
 
 @router.head("/readyz", include_in_schema=False)
-@router.get("/readyz", summary="Is a worker warm", response_model=Health, responses={503: {"model": Health}})
+@router.get(
+    "/readyz", summary="Is a worker warm", response_model=Health, responses={503: {"model": Health}, **MISDIRECTED}
+)
 async def ready(request: Request) -> JSONResponse:
     """Answer 200 once the weights are loaded and a first cloud went through them, 503 before, and once it drains."""
     engine: Engine = request.app.state.engine

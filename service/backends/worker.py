@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
+from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, StraightPCFError, TooLarge
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
@@ -156,6 +156,8 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
         raise
     except StraightPCFError as error:
         return Failed(job.id, error.code, error.message)
+    except OSError as error:  # its folder is read-only, or gone: where another server deletes the job, too
+        return Failed(job.id, ServerBusy.code, f"job {job.id}: its files cannot be used: {error}")
     except Exception as error:
         from straightpcf.model.device import is_lost
 

@@ -52,8 +52,8 @@ class JobFolders:
                 fcntl.flock(handle, fcntl.LOCK_EX)  # for as long as somebody may be sending, however slowly
                 yield Path(name)
             finally:
+                os.close(handle)  # first: a folder that is read-only by now lets nothing be removed
                 Path(name).unlink(missing_ok=True)
-                os.close(handle)
 
     def path(self, folder: str) -> Path:
         """Return where a job's folder is."""

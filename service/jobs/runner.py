@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Any, Literal, Protocol
 
-from straightpcf.points.errors import InternalError, JobCanceled, SpoolFull, StraightPCFError
+from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, SpoolFull, StraightPCFError
 from straightpcf.points.formats import format_named
 from straightpcf.service.backends.base import Backend, FileJob, FileReport, WorkerDied
 from straightpcf.service.jobs.folders import INPUT, JobFolders
@@ -88,6 +88,9 @@ class JobRunner:
                 return
             try:
                 await self._serve_one()
+            except (OSError, sqlite3.Error, SpoolFull) as fault:
+                logger.warning("jobs cannot be taken or written down; leases will run out: %r", fault)
+                await asyncio.sleep(POLL_SECONDS)
             except Exception:
                 logger.exception("a job could not be written down; its lease will run out")
                 await asyncio.sleep(POLL_SECONDS)
@@ -123,6 +126,9 @@ class JobRunner:
             try:  # of these alone: the lease of a job whose end could not be written must run out
                 held = [(running.claim.record.id, running.claim.fence) for running in tended]
                 holds = await self._call(JobStore.extend, held, LEASE_SECONDS)
+            except (OSError, sqlite3.Error, SpoolFull) as fault:
+                logger.warning("the leases could not be renewed; another try follows: %r", fault)
+                continue
             except Exception:
                 logger.exception("the leases could not be renewed; another try follows")
                 continue
@@ -183,7 +189,9 @@ class JobRunner:
             case None:
                 await self._deliver(claim, running.task.result())
             case WorkerDied() as death:
-                await self._after_death(claim, death)
+                await self._after_death(claim, death, "its worker died")
+            case ServerBusy() as trouble:
+                await self._after_death(claim, trouble, "its worker could not use its files")
             case StraightPCFError() as error:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
                 await self._fail(claim, error)
@@ -208,12 +216,12 @@ class JobRunner:
         elif reason == "shutdown":
             await self._release(claim, "the server shut down; the job starts again")
 
-    async def _after_death(self, claim: Claim, death: WorkerDied) -> None:
+    async def _after_death(self, claim: Claim, death: Exception, told: str) -> None:
         logger.warning("%s (the job's death %d of %d)", death, claim.deaths + 1, MAX_DEATHS)
         if claim.deaths + 1 < MAX_DEATHS:
-            await self._release(claim, "its worker died; the job starts again", died=True)
+            await self._release(claim, f"{told}; the job starts again", died=True)
         else:
-            error = InternalError(f"the worker died {MAX_DEATHS} times on this cloud, which was then given up")
+            error = InternalError(f"{told}, {MAX_DEATHS} times; the cloud was then given up")
             await self._fail(claim, error)
 
     async def _fail(self, claim: Claim, error: StraightPCFError) -> None:

@@ -180,8 +180,9 @@ class JobStore:
 
     def extend(self, held: Sequence[tuple[str, int]], lease_seconds: float) -> list[Hold]:
         """Renew leases, given as ids and fences; say of each whether it holds, "canceled" if its job should be."""
-        until, holds = time.time() + lease_seconds, list[Hold]()
+        holds: list[Hold] = []
         with self._transaction():
+            until = time.time() + lease_seconds  # of now: it may have waited for others' locks
             for id, fence in held:
                 mine = self._update(id, fence, "lease_until = ?", until)
                 holds.append("lost" if not mine else "canceled" if self._row(id)["cancel_requested"] else "held")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import sqlite3
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -61,6 +62,8 @@ class Sweeper:
     async def _try(self) -> None:
         try:
             await self.sweep()
+        except (OSError, sqlite3.Error, SpoolFull) as fault:
+            logger.warning("a sweep of the job store failed; another follows: %r", fault)
         except Exception:
             logger.exception("a sweep of the job store failed; another follows")
 

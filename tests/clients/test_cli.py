@@ -139,6 +139,14 @@ def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str
     assert "Started server process" not in done.stderr
 
 
+@pytest.mark.parametrize("host", ["no.such.host", "192.0.2.1", ".."])  # no name, another machine's, none at all
+def test_serve_says_that_its_host_is_none_of_this_machine_before_it_starts_anything(host: str, tmp_path: Path) -> None:
+    done = cli("serve", "--host", host, "--port", "0", "--grpc-port", "0", "--data-dir", tmp_path)
+    assert done.returncode == 2
+    assert f"host is {host!r}, where this machine cannot listen: " in done.stderr.replace("\n", "")
+    assert "Started server process" not in done.stderr
+
+
 def test_info_describes_a_file(scan: Path) -> None:
     xyz = np.load(scan)
     xyz[7] = np.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+from dataclasses import replace
 
 from straightpcf.points.errors import StraightPCFError
 from straightpcf.service.backends.base import FileJob, FileReport, Listener
@@ -81,3 +82,12 @@ class ObedientBackend:
         if job.patches is not None:
             job.patches.write_bytes(self.patches)
         return REPORT
+
+
+class Large(ObedientBackend):
+    """Give results that fill what a connection takes before they are read."""
+
+    async def run(self, job: FileJob, listener: Listener) -> FileReport:
+        report = await super().run(job, listener)
+        job.target.write_bytes(content := bytes(30 << 20))
+        return replace(report, bytes=len(content), sha256=hashlib.sha256(content).hexdigest())

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 from collections.abc import AsyncIterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +17,9 @@ from straightpcf.points.wire import straightpcf_pb2 as pb  # noqa: E402
 from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub  # noqa: E402
 from straightpcf.service.api import grpc as grpc_calls  # noqa: E402
 from straightpcf.service.api import grpc_call  # noqa: E402
-from straightpcf.service.backends.base import FileJob, FileReport, Listener  # noqa: E402
 from straightpcf.service.engine import Engine  # noqa: E402
 from tests.service.engines import until  # noqa: E402
-from tests.service.fakes import ObedientBackend  # noqa: E402
+from tests.service.fakes import Large, ObedientBackend  # noqa: E402
 from tests.service.in_process import free_port, serving  # noqa: E402
 from tests.service.test_races import CLOUD, Commit, nothing_is_left, play, willing  # noqa: E402
 
@@ -109,15 +106,6 @@ def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path:
             assert not any((tmp_path / "incoming").iterdir())
 
     play(scenario)
-
-
-class Large(ObedientBackend):
-    """Give results that fill what a connection takes before they are read."""
-
-    async def run(self, job: FileJob, listener: Listener) -> FileReport:
-        report = await super().run(job, listener)
-        job.target.write_bytes(content := bytes(30 << 20))
-        return replace(report, bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
 
 
 def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(

@@ -194,6 +194,7 @@ def test_wrong_paths_and_methods_are_problems_too(server: RunningServer, method:
     ("path", "allow"),
     [
         ("/jobs", "GET, HEAD, POST"),
+        ("/jobs/", "GET, HEAD, POST"),
         ("/jobs/some", "GET, HEAD, PUT, DELETE"),
         ("/denoise", "POST, PUT"),
         ("/readyz", "GET, HEAD"),

@@ -242,6 +242,7 @@ def test_pages_and_filters(http: httpx2.Client) -> None:
         finished(http, id)
     first = http.get("/jobs?limit=2").json()
     assert [job["id"] for job in first["jobs"]] == made[:0:-1]
+    assert http.get("/jobs/?limit=2").json() == first  # as `POST /jobs/` does what `POST /jobs` does
     second = http.get(f"/jobs?limit=2&cursor={first['next_cursor']}").json()
     assert second["jobs"][0]["id"] == made[0]
     assert http.get("/jobs?state=queued&state=processing").json()["jobs"] == []

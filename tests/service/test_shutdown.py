@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 import os
@@ -17,6 +18,8 @@ import pytest
 
 from tests.clouds import noisy, torus
 from tests.conftest import run_server
+from tests.service.engines import running, submit
+from tests.service.fakes import Large
 from tests.waiting import wait_for
 
 
@@ -33,7 +36,7 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         assert request.poll() is None
         body, _ = request.communicate(timeout=60)
         assert np.load(io.BytesIO(body)).shape == (400, 3)
-        server.process.wait(timeout=20)
+        assert server.process.wait(timeout=20) == 0
         assert not _runs(worker)
         assert not server.spooled_files()
         assert "Traceback" not in server.log.read_text()
@@ -111,6 +114,25 @@ def test_an_upload_that_does_not_end_is_told_so_before_the_server_does(tmp_path:
             assert b'"code":"server_busy"' in said
         server.process.wait(timeout=20)
         assert not server.spooled_files()
+        assert "Traceback" not in server.log.read_text()
+
+
+def test_a_download_that_does_not_end_is_cut_off_in_time_and_quietly(tmp_path: Path) -> None:
+    async def make_a_large_result() -> None:
+        backend = Large()
+        backend.go.set()
+        backend.finish.set()
+        async with running(tmp_path / "data", backend) as engine:
+            await engine.wait((await submit(engine, id="large"))[0].id)
+
+    asyncio.run(make_a_large_result())
+    with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "1"}) as server:
+        host, port = server.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=20) as connection:
+            connection.sendall(b"GET /jobs/large/result HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert connection.recv(12) == b"HTTP/1.1 200"
+            server.process.send_signal(signal.SIGTERM)
+            assert server.process.wait(timeout=20) == 0
         assert "Traceback" not in server.log.read_text()
 
 
