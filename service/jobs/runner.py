@@ -190,7 +190,7 @@ class JobRunner:
                 await self._deliver(claim, running.task.result())
             case WorkerDied() as death:
                 await self._after_death(claim, death, "its worker died")
-            case ServerBusy() as trouble:
+            case ServerBusy(code=ServerBusy.code) as trouble:  # and no kind of it: a full disk is said
                 await self._after_death(claim, trouble, "its worker could not use its files")
             case StraightPCFError() as error:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
