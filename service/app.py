@@ -6,7 +6,6 @@ import asyncio
 import logging
 import signal
 import socket
-import sqlite3
 import sys
 import tempfile
 from collections.abc import AsyncIterator
@@ -22,7 +21,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 import straightpcf
-from straightpcf.points.errors import InvalidOptions, MissingDependency, SpoolFull
+from straightpcf.points.errors import InvalidOptions, MissingDependency
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
 from straightpcf.service.api.errors import install_error_handlers
@@ -38,7 +37,7 @@ from straightpcf.service.backends.worker import WorkerSpec
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
-from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
+from straightpcf.service.jobs.full_disk import DISK_TROUBLES, full_disk_as_spool_full
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
 from straightpcf.service.web import ASSET_PREFIX, install_page
@@ -206,7 +205,7 @@ def _check_start(settings: Settings) -> None:
             with tempfile.TemporaryFile(dir=settings.data_dir):
                 pass
             check_database(settings.data_dir / "jobs.sqlite3")
-    except (OSError, sqlite3.Error, SpoolFull) as exc:
+    except DISK_TROUBLES as exc:
         raise InvalidOptions(f"data_dir is {settings.data_dir}, which cannot hold jobs: {exc}") from exc
     if settings.weights is not None and not settings.weights.is_file():
         raise InvalidOptions(f"weights is {settings.weights}, which is no file")

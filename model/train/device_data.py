@@ -129,10 +129,11 @@ class _Passed:
         origin = gathered(clouds, seeds[:, None])
         inside = _near_first(_nearest(clouds, origin, PATCH_SIZE))
         scale = SCALES[0] + (SCALES[1] - SCALES[0]) * torch.rand(batch_size, 1, 1, device=device)
-        radii = (gathered(clouds, inside) - origin).norm(dim=2).amax(dim=1)
+        around = gathered(clouds, inside) - origin
+        radii = around.norm(dim=2).amax(dim=1)
         scale = scale * _patch_scales(radii, torch.ones_like(radii)).view(-1, 1, 1)
         turn = random_rotations(batch_size, device)
-        here = (gathered(clouds, inside) - origin) @ turn * scale
+        here = around @ turn * scale
         with torch.no_grad():
             time = 1 - self._distance(here).view(-1, 1, 1).clamp(min=SHORTEST)
         centre, radius = self._centres[which, None], self._radii[which, None, None]

@@ -11,8 +11,18 @@ from pathlib import Path
 
 from straightpcf.points.errors import SpoolFull
 
-__all__ = ["RESERVE", "RESERVE_BYTES", "full_disk_as_spool_full", "is_full", "keep_reserve", "release_reserve"]
+__all__ = [
+    "DISK_TROUBLES",
+    "RESERVE",
+    "RESERVE_BYTES",
+    "full_disk_as_spool_full",
+    "is_full",
+    "keep_reserve",
+    "release_reserve",
+]
 
+# What store and folders raise where their disk is full, gone, read-only or locked for long.
+DISK_TROUBLES = (OSError, sqlite3.Error, SpoolFull)
 RESERVE = "reserve"
 RESERVE_BYTES = 2**18  # SQLite takes 32 KiB to open a file, and some 10 pages to end or delete a job
 

@@ -10,10 +10,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Any, Literal, Protocol
 
-from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, SpoolFull, StraightPCFError
+from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, StraightPCFError
 from straightpcf.points.formats import format_named
 from straightpcf.service.backends.base import Backend, FileJob, FileReport, WorkerDied
 from straightpcf.service.jobs.folders import INPUT, JobFolders
+from straightpcf.service.jobs.full_disk import DISK_TROUBLES
 from straightpcf.service.jobs.record import Claim, EventKind, ResultInfo
 from straightpcf.service.jobs.result_name import result_name
 from straightpcf.service.jobs.store import JobStore
@@ -88,7 +89,7 @@ class JobRunner:
                 return
             try:
                 await self._serve_one()
-            except (OSError, sqlite3.Error, SpoolFull) as fault:
+            except DISK_TROUBLES as fault:
                 logger.warning("jobs cannot be taken or written down; leases will run out: %r", fault)
                 await asyncio.sleep(POLL_SECONDS)
             except Exception:
@@ -126,7 +127,7 @@ class JobRunner:
             try:  # of these alone: the lease of a job whose end could not be written must run out
                 held = [(running.claim.record.id, running.claim.fence) for running in tended]
                 holds = await self._call(JobStore.extend, held, LEASE_SECONDS)
-            except (OSError, sqlite3.Error, SpoolFull) as fault:
+            except DISK_TROUBLES as fault:
                 logger.warning("the leases could not be renewed; another try follows: %r", fault)
                 continue
             except Exception:
@@ -171,7 +172,7 @@ class JobRunner:
         for _ in range(END_TRIES):
             try:
                 await self._write_end(running)
-            except (OSError, sqlite3.Error, SpoolFull) as fault:
+            except DISK_TROUBLES as fault:
                 if self._stopping:
                     raise
                 logger.warning("job %s: its end could not be written down yet: %r", running.claim.record.id, fault)

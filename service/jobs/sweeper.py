@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import sqlite3
 from collections.abc import Callable, Collection
 from pathlib import Path
 
 from straightpcf.points.errors import SpoolFull
 from straightpcf.service.jobs.folders import JobFolders
-from straightpcf.service.jobs.full_disk import keep_reserve
+from straightpcf.service.jobs.full_disk import DISK_TROUBLES, keep_reserve
 from straightpcf.service.jobs.runner import StoreCall
 from straightpcf.service.jobs.store import JobStore
 
@@ -62,7 +61,7 @@ class Sweeper:
     async def _try(self) -> None:
         try:
             await self.sweep()
-        except (OSError, sqlite3.Error, SpoolFull) as fault:
+        except DISK_TROUBLES as fault:
             logger.warning("a sweep of the job store failed; another follows: %r", fault)
         except Exception:
             logger.exception("a sweep of the job store failed; another follows")

@@ -57,12 +57,12 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
 
 
 def test_walls_that_the_first_pass_uncovers_are_not_joined_by_the_next() -> None:
-    rough = noisy(plate(2000, 0.04), 0.014)
+    rough = noisy(plate(2000, 0.04, 1), 0.014)
     assert not thin_walls(rough)
     model = load_filter(threads=2)
     once, twice = (model.denoise(rough, DenoiseOptions(iterations=passes)) for passes in (1, 2))
     off = [np.sqrt(np.square(np.abs(result.xyz[:, 2]) - 0.02).mean()) for result in (once, twice)]
-    assert off[1] < 1.15 * off[0]  # 1.22 where they are not looked for again
+    assert off[1] < 1.1 * off[0]
     assert not any("walls" in warning for warning in once.warnings)
     assert any("walls closer together" in warning for warning in twice.warnings)
 
