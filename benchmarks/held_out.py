@@ -1,13 +1,14 @@
 """Compare weights and training states on shapes that were held out of training: what candidates are chosen by.
 
 python -m benchmarks.held_out model/weights/straightpcf.safetensors runs/cvm/state.safetensors [--unseen solids1.npz]
-    [--shapes boy02 solid001] [--resolution 10000] [--noise 0.02 0.03] [--noise-type gaussian] [--iterations 4]
+    [--shapes boy02 solid001] [--resolution 10000] [--random] [--noise 0.02 0.03] [--noise-type gaussian]
+    [--iterations 4]
 
 CD / mean squared height over the surface, x1e-4, in radii of the bounding sphere, of each shape, and their geometric
 and arithmetic means over shapes and seeds: the one weighs all shapes alike, the other shows walls that are joined. The
-50K points of a shape stand for its surface. All candidates get the DistanceModule and the calibration of the weights
-that ship, so only their velocities differ. `--unseen` names an archive of which nothing was trained on, like solids
-made with a seed of their own.
+50K points of a shape stand for its surface; `--random` draws any number of them by chance. All candidates get the
+DistanceModule and the calibration of the weights that ship, so only their velocities differ. `--unseen` names an
+archive of which nothing was trained on, like solids made with a seed of their own.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network, take_distance_module
+from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import DenoiseOptions
+
+_DRAW_SEED = 5  # of --random: all candidates get the same points
 
 
 @errors_in_one_line()
@@ -39,7 +43,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument("--unseen", type=Path, action="append", default=[])
     parser.add_argument("--shapes", nargs="+", help="default: all that are held out or unseen")
-    parser.add_argument("--resolution", type=int, default=10000)
+    parser.add_argument("--resolution", type=int, default=10000, help="one that the archives have, or see --random")
+    parser.add_argument("--random", action="store_true", help="points by chance, as from a mesh, instead of even ones")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.02, 0.03])
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument(
@@ -73,7 +78,12 @@ def _truths(arguments: argparse.Namespace) -> Iterator[tuple[str, Truth]]:
             every = {name.split("/")[0] for name in archive.files}
             held_out = held_out_shapes(archive.files) if path == arguments.data else every
             for shape in sorted(held_out if arguments.shapes is None else held_out.intersection(arguments.shapes)):
-                yield shape, Truth.read(archive, shape, arguments.resolution)
+                if arguments.random:
+                    yield shape, Truth.drawn(archive, shape, arguments.resolution, _DRAW_SEED)
+                elif f"{shape}/{arguments.resolution}" in archive:
+                    yield shape, Truth.read(archive, shape, arguments.resolution)
+                else:
+                    raise InvalidOptions(f"{path} has no {shape}/{arguments.resolution}; --random draws any number")
 
 
 def _filter(path: Path, threads: int | None) -> Filter:

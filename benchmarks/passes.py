@@ -29,6 +29,7 @@ from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.normals import recompute_normals
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network, take_distance_module
+from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import DenoiseOptions
 
 _AROUND = 150  # points of the 50K over which curvature is taken
@@ -61,6 +62,19 @@ class Truth:
         surface = archive[f"{shape}/50000"].astype(np.float64)
         frame = CloudFrame.of(surface)
         return cls.of(frame.enter(archive[f"{shape}/{resolution}"].astype(np.float64)), frame.enter(surface))
+
+    @classmethod
+    def drawn(cls, archive: Mapping[str, npt.NDArray[np.float32]], shape: str, count: int, seed: int) -> Truth:
+        """Draw `count` of the 50K points of a shape by chance, in the unit-ball frame of all of them.
+
+        Raises InvalidOptions where that is more than there are.
+        """
+        surface = archive[f"{shape}/50000"].astype(np.float64)
+        if count > len(surface):
+            raise InvalidOptions(f"no {shape}/{count} can be drawn of {len(surface)} points")
+        surface = CloudFrame.of(surface).enter(surface)
+        chosen = np.random.default_rng(seed).choice(len(surface), size=count, replace=False)
+        return cls.of(surface[chosen], surface)
 
     def heights(self, xyz: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         """Return how high over the surface points (N, 3) are, and the surface's points below them, both (N,)."""

@@ -28,7 +28,7 @@ class Calibration:
     crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
     dense points the second leaves more than of few.
     stuck: where a second pass is due, but d after the first is more than this share of d at the start, and that was
-    below _PLAIN, walls close together were read, not noise: further passes would join them.
+    below _ONE_PASS_DISTANCE, walls close together were read, not noise: further passes would join them.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 

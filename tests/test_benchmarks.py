@@ -137,14 +137,15 @@ def test_weights_of_a_state_keep_what_ships_beside_their_velocities(tmp_path: Pa
     assert says["training"]["mean_with"] == about["training"]
 
 
-def test_candidates_are_compared_on_what_is_held_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("points", [("--resolution", 1000), ("--random", "--resolution", 700)])
+def test_candidates_are_compared_on_what_is_held_out(points: tuple[object, ...], tmp_path: Path) -> None:
     clouds = {f"{name}/1000": sphere(1000) for name in "abcdefghijkl"}
     clouds |= {f"{name}/50000": sphere(50_000) for name in "fz"} | {"z/1000": sphere(1000)}
     np.savez(tmp_path / "trained.npz", **{name: xyz for name, xyz in clouds.items() if name[0] != "z"})
     np.savez(tmp_path / "unseen.npz", **{name: xyz for name, xyz in clouds.items() if name[0] == "z"})
     printout = printed(
         "held_out", DEFAULT_WEIGHTS, "--data", tmp_path / "trained.npz", "--unseen", tmp_path / "unseen.npz",
-        "--resolution", 1000, "--noise", 0.02, "--seeds", 0, "--iterations", 1, "--threads", 1,
+        *points, "--noise", 0.02, "--seeds", 0, "--iterations", 1, "--threads", 1,
     )  # fmt: skip
     first, row, mean = printout.splitlines()
     assert first.split(" of ")[1] == "f | z"
@@ -155,6 +156,15 @@ def test_candidates_are_compared_on_what_is_held_out(tmp_path: Path) -> None:
         assert 0 < height < 4  # the noise's own is 4
         assert chamfer > height
     assert all(more >= less - 0.001 for less, more in zip(geometric, arithmetic, strict=True))
+
+
+def test_points_that_an_archive_lacks_are_named_in_one_line(tmp_path: Path) -> None:
+    np.savez(tmp_path / "trained.npz", **{f"{name}/50000": sphere(50_000) for name in "abcdef"})
+    for points in (("--resolution", 700), ("--random", "--resolution", 60_000)):
+        ended = _run("held_out", DEFAULT_WEIGHTS, "--data", tmp_path / "trained.npz", *points)
+        assert ended.returncode == 1
+        (line,) = ended.stderr.splitlines()
+        assert f"f/{points[-1]}" in line
 
 
 @pytest.mark.parametrize("name", ["held_out", "passes", "velocities", "quality", "calibrate"])
