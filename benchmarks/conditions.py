@@ -149,6 +149,17 @@ def _discrete(std: float) -> Make:
     return make
 
 
+def _merged(first: float, second: float, apart: float) -> Make:
+    """Make two scans of one surface, each of half of the points, with noise of a std each, that do not quite fit."""
+
+    def make(rng: np.random.Generator, clean: Floats) -> Condition:
+        of_second = rng.random((len(clean), 1)) < 0.5
+        noisy = clean + np.where(of_second, second, first) * rng.normal(size=clean.shape)
+        return Condition(clean, noisy + np.where(of_second, apart, 0.0) * _BEAM / np.linalg.norm(_BEAM))
+
+    return make
+
+
 def _fewer(keep: Callable[[np.random.Generator, Floats], npt.NDArray[np.bool_]], std: float) -> Make:
     """Make noise in those points that are kept."""
 
@@ -171,6 +182,7 @@ CONDITIONS: dict[str, Make] = {
     "student": _heavy(0.01),
     "outliers": _some(0.05, 0.06, 0.01),
     "clean-fifth": _some(0.2, 0.0, 0.02),
+    "merged": _merged(0.005, 0.01, 0.01),
     "thinning": _fewer(lambda rng, clean: rng.random(len(clean)) < (0.05 + 0.95 * _along(clean)[:, 0]) ** 2, 0.01),
     "cut": _fewer(lambda _, clean: _along(clean)[:, 0] > 0.5, 0.02),
     "thousand": _fewer(lambda rng, clean: rng.permutation(len(clean)) < 1000, 0.02),
