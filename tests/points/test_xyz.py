@@ -309,3 +309,11 @@ def test_to_write_a_table_takes_a_few_times_its_size(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     np.testing.assert_allclose(np.loadtxt(tmp_path / "b.xyz"), cloud.xyz + 1e-3)
+
+
+@pytest.mark.parametrize(
+    "row", ["1,2,3,4,5,6", "1, 2, 3, 4, 5, 6", "10,20,30,255,255,255", "1,2,3,0,0,0", "0,5, 1,5,2,5"]
+)
+def test_six_columns_of_whole_numbers_are_no_decimal_commas(row: str, tmp_path: Path) -> None:
+    cloud = read(tmp_path, f"{row}\n{row}\n".encode())
+    assert cloud.xyz[1].tolist() == [float(cell) for cell in row.split(",")[:3]]

@@ -82,6 +82,10 @@ MALFORMED = {
     "UTF-16": ("1 2 3\n".encode("utf-16"), r"UTF-16.*UTF-8"),
     "decimal commas": (b"1 2 3\n0,5 -1,5 2,5\n", r"line 2"),
     "decimal commas only": (b"0,5 -1,5 2,5\n" * 2, r"line 1, column 2: '5 -1' is no number; decimals have a point"),
+    "decimal commas and whole numbers": (b"0,5 1 2,5\n", r"column 2: '5 1 2' is no number; decimals have a point"),
+    "decimal commas between tabs": (b"0,5\t1,5\t2,5\n", r"decimals have a point"),
+    "decimal commas behind commas": (b"# a\n0,5, -1,5, 2,5\n", r"line 2 looks like .*'0,5, -1,5, 2,5'.* have a point"),
+    "decimal commas between commas": (b"0,500,1,050,-2,500\n" * 1000, r"line 1 looks like .*decimals have a point"),
     "decimal commas between semicolons": (b"x;y;z\n0,5;1,5;2\n", r"line 2, column 1: '0,5'.*decimals have a point"),
 }
 
