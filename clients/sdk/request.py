@@ -247,7 +247,8 @@ def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     if isinstance(source, str | os.PathLike):
         path = Path(source)
         if not path.is_file():  # a pipe has no size to declare, and cannot be sent again
-            raise FileNotFoundError(f"{path} is no file")
+            hint = ": of a pipe, give its bytes" if path.exists() and not path.is_dir() else ""
+            raise FileNotFoundError(f"{path} is no file{hint}")
         return path.name, path
     if isinstance(source, bytes | bytearray | memoryview):
         return None, bytes(source)
@@ -266,7 +267,8 @@ def _sendable(name: str | Path | None) -> str | None:
 
 def _npy(source: npt.NDArray[Any]) -> bytes:
     if source.ndim != 2 or source.shape[1] != 3 or source.dtype.kind not in "fiu":
-        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {source.shape} {source.dtype}")
+        hint = "; transpose it" if source.ndim == 2 and source.shape[0] == 3 else ""
+        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {source.shape} {source.dtype}{hint}")
     xyz = np.asarray(source)
     if xyz.dtype.kind != "f" or xyz.dtype.itemsize > 8:
         xyz = xyz.astype(np.float64)

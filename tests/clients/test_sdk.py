@@ -147,10 +147,12 @@ def test_what_can_be_known_here_is_refused_before_anything_is_sent() -> None:
     with Client("http://127.0.0.1:1") as client:
         with pytest.raises(InvalidOptions):
             client.denoise(sphere(100), iterations=0)
-        with pytest.raises(InvalidCloud, match=r"\(3, 100\)"):
+        with pytest.raises(InvalidCloud, match=r"\(3, 100\).*transpose"):
             client.denoise(sphere(100).T)
         with pytest.raises(FileNotFoundError):
             client.denoise("no-such-file.ply")
+        with pytest.raises(FileNotFoundError, match="of a pipe, give its bytes"):
+            client.denoise("/dev/null")
         with pytest.raises(InvalidRequest, match="give its bytes"):
             client.denoise(io.BytesIO(b"x"))
 
