@@ -144,6 +144,12 @@ def _declaring(shape: str, descr: str = "'<f8'", fortran: str = "False") -> byte
     return _npy_header(f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}}}\n")
 
 
+def _zipped(name: str) -> bytes:
+    with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:
+        archive.writestr(name, "ply")
+    return buffer.getvalue()
+
+
 def _altered(raw: bytes) -> bytes:
     """Damage the packed bytes of the first member."""
     at = raw.index(b"points.npy") + 60
@@ -190,7 +196,8 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "no zip": (b"PK\x03\x04" + bytes(200), MalformedFile, "NPZ"),
     "truncated zip": (npz(points=torus(50))[:-30], MalformedFile, "NPZ"),
     "damaged zip": (_altered(npz(points=torus(50))), MalformedFile, "NPZ"),
-    "no arrays": (npz(), UnsupportedCloud, "no arrays"),
+    "no arrays": (npz(), UnsupportedCloud, "no arrays.*but nothing"),
+    "a zip of another file": (_zipped("scan.ply"), UnsupportedCloud, r"no arrays.*but scan\.ply: unpack it"),
     "no positions": (npz(label=np.arange(5)), UnsupportedCloud, "label"),
     "normals alone": (npz(normals=np.ones((5, 3))), UnsupportedCloud, "0 arrays.*normals"),
     "two candidates": (npz(a=np.zeros((5, 3)), b=np.zeros((5, 3))), UnsupportedCloud, "2 arrays.*a, b"),
