@@ -72,6 +72,8 @@ MALFORMED = {
         b"id,lon,lat,h\n1,2,3,4\n",
         r"names above line 2 .*id,lon,lat,h.*easting, northing",
     ),
+    "degrees": (b"Lat,Lon,Alt (m)\n1,2,3\n", r"names above line 2 are of degrees.*Lat,Lon,Alt.*project"),
+    "degrees in a comment": (b"# longitude latitude height\n1 2 3\n", r"names above line 2 are of degrees"),
     "fewer names than columns": (
         b"x y z\n1 2 3 4\n",
         r"line 1 names 3 columns.*'x y z'.*line 2 has 4",
