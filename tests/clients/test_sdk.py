@@ -212,8 +212,9 @@ def test_arrays_of_every_kind_are_sent_as_numbers_that_a_server_reads() -> None:
     np.testing.assert_array_equal(sent(masked), np.array([[1, 1, 1], [np.nan, 1, 1]], dtype=np.float32))
     assert sent(np.ones((2, 3), dtype=np.longdouble)).dtype == np.float64
     assert sent([[1, 2, 3], [4, 5, 6]]).dtype == np.float64
-    with pytest.raises(InvalidCloud):
-        sent([[1, 2, 3], [4, 5]])
+    for wrong, text in (([[1, 2, 3], [4, 5]], "inhomogeneous"), ((row for row in [[1, 2, 3]]), "got a generator")):
+        with pytest.raises(InvalidCloud, match=text):
+            sent(wrong)
 
 
 def test_an_open3d_cloud_without_open3d_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
