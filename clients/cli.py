@@ -32,7 +32,7 @@ from straightpcf.clients.console import (
     show_noise,
 )
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
-from straightpcf.clients.stdio import STDIO, input_file, output_file
+from straightpcf.clients.stdio import STDIO, input_file, input_name, output_file
 from straightpcf.points import errors
 
 __all__ = ["app", "main"]
@@ -134,7 +134,7 @@ def denoise(
     from straightpcf.points.options import DenoiseOptions
 
     wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
-    name = name or (None if source == STDIO else source.name)
+    name = name or input_name(source)
     suffix = Path(name or "").suffix
     if target != STDIO:
         check_target(target)
@@ -243,7 +243,8 @@ def serve(
 
 @app.command()
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The cloud; - for stdin.")],
+    name: Name = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say what is in a file: format, points, fields, bounds, rows that are NaN or infinite."""
@@ -251,7 +252,9 @@ def info(
 
     from straightpcf.points.formats import read_cloud
 
-    cloud, format = read_cloud(file)
+    name = name or input_name(file)
+    with input_file(file, name) as path:
+        cloud, format = read_cloud(path, name=name or "the cloud")
     valid = np.isfinite(cloud.xyz).all(axis=1)
     has_bounds = bool(valid.any())
     facts: dict[str, Any] = {

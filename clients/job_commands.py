@@ -11,7 +11,7 @@ import typer
 
 from straightpcf.clients.atomic import check_target
 from straightpcf.clients.console import for_each, interruptible, print_json, print_table, progress_bar, show_noise
-from straightpcf.clients.stdio import STDIO, stdin, stdout
+from straightpcf.clients.stdio import STDIO, content_of, input_name, is_stream, stdout
 from straightpcf.points.errors import InvalidOptions
 
 if TYPE_CHECKING:
@@ -69,10 +69,10 @@ def submit(
     with connect(url, api_key) as client:
 
         def hand_over(source: Path) -> None:
-            content: Any = stdin().read() if source == STDIO else source
+            content: Any = content_of(source) if is_stream(source) else source
             job = client.jobs.create(
                 content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
-                format=format, name=name, id=id,
+                format=format, name=name or input_name(source), id=id,
             )  # fmt: skip
             print_json(job.info.json) if as_json else typer.echo(job.id)
 

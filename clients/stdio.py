@@ -1,4 +1,4 @@
-"""Files in the place of stdin and stdout: formats are read from files, not from pipes."""
+"""Files in the place of stdin, stdout and pipes: formats are read from files."""
 
 from __future__ import annotations
 
@@ -13,14 +13,9 @@ from typing import BinaryIO, TextIO
 from straightpcf.clients.atomic import place_named
 from straightpcf.points.errors import InvalidRequest
 
-__all__ = ["STDIO", "input_file", "output_file", "stdin", "stdout"]
+__all__ = ["STDIO", "content_of", "input_file", "input_name", "is_stream", "output_file", "stdout"]
 
 STDIO = Path("-")
-
-
-def stdin() -> BinaryIO:
-    """Return stdin's bytes; raises InvalidRequest where it is closed."""
-    return _open(sys.stdin, "stdin").buffer
 
 
 def stdout() -> BinaryIO:
@@ -28,20 +23,46 @@ def stdout() -> BinaryIO:
     return _open(sys.stdout, "stdout").buffer
 
 
+def is_stream(source: Path) -> bool:
+    """Say whether an input is stdin or a pipe, such as a shell's <(...): it can be read once, and has no size."""
+    return source == STDIO or source.is_fifo() or source.is_char_device()
+
+
+def input_name(source: Path) -> str | None:
+    """Return what an input is called: nothing says it of stdin, and of /dev/stdin or /dev/fd/63."""
+    return None if is_stream(source) and not source.suffix else source.name
+
+
+@contextmanager
+def _opened(source: Path) -> Iterator[BinaryIO]:
+    """Open a stream; raises InvalidRequest where stdin is closed."""
+    if source == STDIO:
+        yield _open(sys.stdin, "stdin").buffer
+    else:
+        with source.open("rb") as stream:
+            yield stream
+
+
+def content_of(source: Path) -> bytes:
+    """Return what a stream has."""
+    with _opened(source) as stream:
+        return stream.read()
+
+
 @contextmanager
 def input_file(source: Path, name: str | None) -> Iterator[Path]:
-    """Lend the file to read, which for - holds what stdin had; name: what its format is told by."""
+    """Lend the file to read, which for a stream holds what that had; name: what its format is told by."""
     from straightpcf.points.formats import recognised
     from straightpcf.points.formats.base import HEAD_BYTES
 
-    if source != STDIO:
+    if not is_stream(source):
         if not source.is_file():
-            raise FileNotFoundError(f"{source} is no file")
+            raise FileNotFoundError(f"{source} is {'a folder' if source.is_dir() else 'no file'}")
         yield source
         return
     with tempfile.NamedTemporaryFile() as spool:
-        with place_named(spool.name):
-            shutil.copyfileobj(stdin(), spool)
+        with _opened(source) as stream, place_named(spool.name):
+            shutil.copyfileobj(stream, spool)
             spool.flush()
         spool.seek(0)
         recognised(spool.read(HEAD_BYTES), name)

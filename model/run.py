@@ -18,7 +18,8 @@ from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import restrained_step, trusted_noise_stds
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
-from straightpcf.points.errors import InvalidCloud, TooFewPoints
+from straightpcf.points.cloud import as_positions
+from straightpcf.points.errors import TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 
 if TYPE_CHECKING:
@@ -72,7 +73,8 @@ class Run:
     """One cloud on its way through the filter."""
 
     def __init__(self, owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> None:
-        self.filter, self.options, self.xyz = owner, options, (xyz := _numbers(points))
+        xyz = as_positions(points).astype(np.float64, copy=False)
+        self.filter, self.options, self.xyz = owner, options, xyz
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
@@ -264,10 +266,3 @@ class Run:
             device=owner.device,
             workers=owner.threads,
         )
-
-
-def _numbers(xyz: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    array = np.asarray(xyz)
-    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
-        raise InvalidCloud(f"points must be (N, 3) numbers, got {array.shape} {array.dtype}")
-    return array.astype(np.float64, copy=False)

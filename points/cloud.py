@@ -1,4 +1,4 @@
-"""The point cloud in memory: positions to change, everything else to carry."""
+"""The point cloud in memory: positions to change, everything else to carry; and what is taken for positions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["NORMALS", "PointCloud"]
+from straightpcf.points.errors import InvalidCloud
+
+__all__ = ["NORMALS", "PointCloud", "as_positions"]
 
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))  # what files call them
 
@@ -75,3 +77,22 @@ class PointCloud:
         if xyz.shape != self.xyz.shape:
             raise ValueError(f"positions for {len(self)} points must be {self.xyz.shape}, got {xyz.shape}")
         return replace(self, xyz=xyz)
+
+
+def as_positions(points: Any) -> npt.NDArray[np.floating[Any]]:
+    """Return (N, 3) numbers of any kind, lists and tensors among them, as floats of 16, 32 or 64 bits.
+
+    What is masked is no point: it becomes NaN, and passes through as such. Raises InvalidCloud.
+    """
+    try:
+        array = np.ma.asanyarray(points)
+    except (TypeError, ValueError, RuntimeError) as exc:  # rows of several lengths, and torch's own reasons
+        raise InvalidCloud(f"points must be (N, 3) numbers: {exc}") from exc
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        got = f"{array.shape} {array.dtype}" if array.ndim else f"a {type(points).__name__}"
+        hint = "; transpose them" if array.ndim == 2 and len(array) == 3 else ""
+        raise InvalidCloud(f"points must be (N, 3) numbers, got {got}{hint}")
+    xyz: npt.NDArray[Any] = np.asarray(array)
+    if xyz.dtype.kind != "f" or xyz.dtype.itemsize > 8:
+        xyz = xyz.astype(np.float64)
+    return np.where(np.ma.getmaskarray(array), np.nan, xyz) if np.ma.is_masked(array) else xyz

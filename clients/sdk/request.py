@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.clients.atomic import check_target
-from straightpcf.points.errors import InvalidCloud, InvalidRequest, NotFound
+from straightpcf.points.cloud import as_positions
+from straightpcf.points.errors import InvalidRequest, NotFound
 from straightpcf.points.formats import format_by_suffix, format_named, format_wanted, recognised
 from straightpcf.points.formats.base import HEAD_BYTES
 from straightpcf.points.options import DenoiseOptions
@@ -247,34 +248,21 @@ def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     if isinstance(source, str | os.PathLike):
         path = Path(source)
         if not path.is_file():  # a pipe has no size to declare, and cannot be sent again
-            raise FileNotFoundError(f"{path} is no file")
+            hint = ": of a pipe, give its bytes" if path.exists() and not path.is_dir() else ""
+            raise FileNotFoundError(f"{path} is no file{hint}")
         return path.name, path
     if isinstance(source, bytes | bytearray | memoryview):
         return None, bytes(source)
     if hasattr(source, "read"):
         raise InvalidRequest("a source is a path, bytes, an array or an open3d cloud; of an open file, give its bytes")
-    try:
-        return "cloud.npy", _npy(np.ma.asanyarray(getattr(source, "points", source)))
-    except ValueError as exc:  # rows of several lengths
-        raise InvalidCloud(f"an array of points must be (N, 3) numbers: {exc}") from exc
+    buffer = io.BytesIO()
+    np.save(buffer, as_positions(getattr(source, "points", source)), allow_pickle=False)
+    return "cloud.npy", buffer.getvalue()
 
 
 def _sendable(name: str | Path | None) -> str | None:
     """Return a file's name as text that every transport carries; bytes of it that are no UTF-8 become `?`."""
     return None if name is None else os.fspath(name).encode("utf-8", "replace").decode()
-
-
-def _npy(source: npt.NDArray[Any]) -> bytes:
-    if source.ndim != 2 or source.shape[1] != 3 or source.dtype.kind not in "fiu":
-        raise InvalidCloud(f"an array of points must be (N, 3) numbers, got {source.shape} {source.dtype}")
-    xyz = np.asarray(source)
-    if xyz.dtype.kind != "f" or xyz.dtype.itemsize > 8:
-        xyz = xyz.astype(np.float64)
-    if (hidden := np.ma.getmaskarray(source)).any():  # what is masked is no point, and passes through as such
-        xyz = np.where(hidden, np.nan, xyz)
-    buffer = io.BytesIO()
-    np.save(buffer, xyz, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def _read_chunks(path: Path, size: int) -> Generator[bytes]:

@@ -48,6 +48,16 @@ _NOT_OURS = {
     "as (N, 5) float32 in a .npy file it can be taken"
 }
 
+# How files begin that hold another one.
+_PACKED = {
+    b"\x1f\x8b\x08": "gzip",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ\0": "xz",
+    b"\x28\xb5\x2f\xfd": "zstd",
+    b"7z\xbc\xaf\x27\x1c": "7-Zip",
+    b"Rar!\x1a\x07": "RAR",
+}
+
 
 def estimate_points(path: Path, *, name: str | None = None) -> int:
     """Guess how many points a file holds without reading it; never more than its bytes could be."""
@@ -132,6 +142,9 @@ def recognised(head: bytes, called: str | None) -> Format:
     for format in FORMATS:
         if format.has_magic and format.sniff(head):
             return format
+    for magic, packer in _PACKED.items():
+        if head.startswith(magic):
+            raise UnknownFormat(f"{name[:80]} is packed with {packer}: unpack it first")
     begins, suffix = f"{name[:80]} begins with {head[:8]!r}, which no format does", PurePath(name).suffix.lower()
     for ending, why in _NOT_OURS.items():
         if name.lower().endswith(ending):

@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
-from straightpcf.points.formats.base import Format, check_count
+from straightpcf.points.formats.base import HEAD_BYTES, Format, check_count
 from straightpcf.points.formats.positions import AXES, narrowed, put_positions, rounding, widened
 
 __all__ = ["Kitti"]
 
 ROW_BYTES = 16
+_TEXT = bytes(range(32, 127)) + b"\t\r\n"
 _MOST_LOST = 1e-4  # of the cloud's extent, by rounding; a frame's own is 1e-7, a town's in UTM coordinates 1e-3
 
 
@@ -52,6 +53,8 @@ class Kitti(Format):
                 f"a KITTI frame has {ROW_BYTES} bytes a point; of {size} bytes the last {size % ROW_BYTES} are none"
             )
         raw = path.read_bytes()
+        if raw and not raw[:HEAD_BYTES].translate(None, _TEXT):  # which reads as small numbers, none below 0
+            raise UnsupportedCloud("a KITTI frame has four float32 a point, and this is text: call it .xyz or .csv")
         rows = np.frombuffer(raw, "<f4").reshape(-1, 4)
         _check_intensity(rows[:, 3])
         xyz = widened([rows[:, axis] for axis in range(3)])

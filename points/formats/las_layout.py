@@ -140,7 +140,7 @@ def read_header(raw: bytes) -> LasHeader:
     check_room(begin, len(raw), what="the LAS point data offset")
     kind, row_bytes, points = struct.unpack_from("<BHI", raw, 104)
     if minor >= 4:
-        points = struct.unpack_from("<Q", raw, 247)[0]
+        points = struct.unpack_from("<Q", raw, 247)[0] or points  # which some writers of old leave alone
     if kind & 0x40:
         raise UnsupportedCloud(f"LAS point format byte is {kind}: compression of before LASzip 1.0 is not known")
     point_format = kind & 0x3F

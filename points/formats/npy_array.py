@@ -31,6 +31,7 @@ __all__ = [
 MAGIC = b"\x93NUMPY"
 HEADER_BYTES = 10_000 + 12  # what numpy itself takes of a header, and what stands before it
 MAX_COLUMNS = 4096
+_FEWEST = 33  # points that are filtered: of fewer rows, that many columns are the points
 _AXES = (("x", "y", "z"), ("X", "Y", "Z"))
 _FLOATS = re.compile(r"[<>=|]?f[248]")
 _PYTHON_2 = re.compile(r"(\d)L(?=[,)])")  # (400L, 3L)
@@ -117,12 +118,16 @@ def positions_header(head: bytes, *, where: str, max_points: int) -> NpyHeader:
     descr = str(header.descr)[:60]
     if _has_objects(header.descr):
         raise UnsupportedCloud(f"{where} holds Python objects ({descr}); they are never unpickled")
+    shape = str(header.shape)[:60]
     if not header.is_positions:
-        shape = str(header.shape)[:60]
+        is_image = len(header.shape) > 2 and header.shape[-1] == 3  # of a depth camera, or a batch of one
+        hint = "; reshape(-1, 3) makes such rows of it" if is_image else ""
         raise UnsupportedCloud(
             f"{where} has shape {shape} and type {descr}; positions are (N, >= 3) floats f2, f4, f8"
-            ", or (N,) records with such x, y, z"
+            f", or (N,) records with such x, y, z{hint}"
         )
+    if header.axes is None and 3 <= header.shape[0] < _FEWEST <= header.shape[1]:
+        raise UnsupportedCloud(f"{where} has shape {shape}, more columns than rows; a point is a row: transpose it")
     if header.axes is None and header.shape[1] > MAX_COLUMNS:
         raise UnsupportedCloud(f"{where} has {header.shape[1]} columns; the limit is {MAX_COLUMNS}")
     check_count(header.shape[0], max_points, where=where)

@@ -148,9 +148,14 @@ def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile
     called = next((key for key in KEYS if key in by_name), None)
     if called and not fitting:
         return by_name[called]  # reading it says what is wrong with it
+    if not members:
+        held = ", ".join(archive.namelist())[:200]
+        raise UnsupportedCloud(
+            f"the zip archive holds no arrays, as NPZ does, but {held or 'nothing'}: unpack it first"
+        )
     raise UnsupportedCloud(
         f"the NPZ archive has {len(fitting)} arrays of shape (N, >= 3), and none named {', '.join(KEYS)}: "
-        f"{', '.join(fitting or by_name)[:200] or 'no arrays at all'}"
+        f"{', '.join(fitting or by_name)[:200]}"
     )
 
 

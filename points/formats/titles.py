@@ -19,6 +19,8 @@ _AROUND = b'" \t\n\v\f\r'  # a cell between delimiters
 _POSITIONS = (
     AXES,
     ("points:0", "points:1", "points:2"),
+    ("points_m_xyz:0", "points_m_xyz:1", "points_m_xyz:2"),  # VeloView's
+    ("point_x", "point_y", "point_z"),  # ArcGIS's
     ("px", "py", "pz"),
     ("pos_x", "pos_y", "pos_z"),
     *(("easting", "northing", height) for height in ("elevation", "height", "altitude", "z")),
@@ -28,6 +30,7 @@ _POSITIONS = (
     ("x1", "y1", "z1"),  # Ouster's first returns
     ("0", "1", "2"),  # pandas' numbers of columns
 )
+_DEGREES = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"})
 _UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
 _LEAD = re.compile(rb"^[^,;\t:]*:\s+")  # columns: x y z
@@ -57,6 +60,11 @@ def named_columns(
             if axes := _axes(words):
                 once = [word if word and words.count(word) == 1 else "" for word in words]
                 return tuple(word or label for word, label in zip(once, labels, strict=True)), axes
+        if title and any(_are_degrees(words) for words in fitting):
+            raise MalformedFile(
+                f"the names above line {line} are of degrees: {shown(title.text)}; no distance can be told in them: "
+                "project the points first (easting, northing, height)"
+            )
         if title is names and columns > 3:  # a remark may be any text
             _refuse(title, line, columns, marks, fits=bool(fitting))
     return tuple(labels), None
@@ -119,6 +127,11 @@ def _refuse(names: Title | None, line: int, columns: int, marks: Sequence[bytes]
             more = " or more" if len(words) > columns + 1 else ""
             said = f"line {names.line} names {len(words)}{more} columns: {shown(names.text)}"
             raise MalformedFile(f"{said}; line {line} has {columns}, so which of them are x, y, z is not known")
+
+
+def _are_degrees(words: Sequence[str]) -> bool:
+    plain = {_UNIT.sub("", word).lower() for word in words}
+    return all(plain & names for names in _DEGREES)
 
 
 def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:

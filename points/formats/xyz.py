@@ -33,6 +33,9 @@ __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Tsv", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
 _COUNTED = 10  # points: of fewer, an x may go up by one each
+_LOOKED_AT = 1 << 14  # bytes of the first rows, which tell decimal commas from cells
+# Three numbers or more, each of two cells between commas: 0,5, 1,5, 2,5.
+_PAIRS = re.compile(rb"\s*[+-]?\d+,\d+(?:,\s*[+-]?\d+,\d+){2,}\s*")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _WHOLE = np.dtype(np.int64)
 _Offsets = npt.NDArray[np.int64]
@@ -81,6 +84,8 @@ class Xyz(Format):
         raw = path.read_bytes()
         refuse_binary(raw, 0)
         layout = read_layout(raw, self.marks)
+        if not layout.is_named and layout.delimiter == b",":
+            _refuse_decimal_commas(raw[layout.begin : layout.begin + _LOOKED_AT], layout.line)
         if layout.declared is not None:
             check_count(layout.declared, max_points, f"line {layout.line - 1}")
         starts, ends, columns, texts = _table(raw, layout, max_points)
@@ -212,7 +217,28 @@ def _table(
 
 def _has_decimal_comma(text: bytes, delimiter: bytes | None) -> bool:
     """Say whether a cell looks like 0,5, or, where commas were taken for delimiters, like what is between two such."""
-    return re.fullmatch(rb"\d+\s+[+-]?\d+" if delimiter == b"," else rb"[+-]?\d+,\d+", text) is not None
+    return re.fullmatch(rb"\d+(\s+[+-]?\d+)+" if delimiter == b"," else rb"[+-]?\d+,\d+", text) is not None
+
+
+def _refuse_decimal_commas(raw: bytes, line: int) -> None:
+    """Raise where the first rows read as numbers with decimal commas that commas separate: there would be two of each.
+
+    Told by white space before every number, and none inside, or by decimals that are equally many and begin with 0.
+    """
+    rows = [row for row in raw.splitlines() if row.strip() and not row.startswith((b"#", b"//"))]
+    rows = rows[:-1] if len(rows) > 1 and len(raw) == _LOOKED_AT else rows  # the last may be cut
+    if not rows or not all(_PAIRS.fullmatch(row) for row in rows):
+        return
+    are_apart = all(mark[-1:].isspace() for row in rows for mark in re.findall(rb"\d+,\d+(,\s*)", row))
+    decimals = [cell for row in rows for cell in row.split(b",")[1::2]]
+    are_alike = len({len(cell.strip()) for cell in decimals}) == 1 and any(
+        cell.startswith(b"0") and len(cell.strip()) > 1 for cell in decimals
+    )
+    if are_apart or are_alike:
+        raise MalformedFile(
+            f"line {line} looks like numbers with decimal commas between commas: {shown(rows[0].strip())}; "
+            "decimals have a point here, no comma"
+        )
 
 
 def _refuse_counted(columns: Mapping[int, npt.NDArray[Any]], line: int) -> None:

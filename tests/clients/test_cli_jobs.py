@@ -202,6 +202,8 @@ def test_submit_takes_text_from_stdin_with_its_name(server: RunningServer) -> No
     assert cli(server, "wait", id).returncode == 0
     assert json.loads(cli(server, "status", id, "--json").stdout)["name"] == "piped.txt"
     assert cli(server, "submit", "-", stdin=text).returncode == 3
+    as_file = cli(server, "submit", "/dev/stdin", "--name", "p.txt", "--iterations", 1, stdin=text).stdout.decode()
+    assert cli(server, "wait", as_file.strip()).returncode == 0
     assert cli(server, "submit", "a.xyz", "b.xyz", "--name", "c.xyz").returncode == 2
 
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import io
-import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -19,20 +15,15 @@ import numpy as np
 import pytest
 
 from straightpcf.clients import sdk
-from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, retry, transport
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job
 from straightpcf.clients.sdk.aio import AsyncJobs
 from straightpcf.clients.sdk.client import Jobs
-from straightpcf.clients.sdk.receive import Body
-from straightpcf.clients.sdk.request import Call, upload_call
-from straightpcf.clients.sdk.transport import Attempts
+from straightpcf.clients.sdk.request import upload_call
 from straightpcf.points.errors import (
-    ConnectionFailed,
-    InternalError,
     InvalidCloud,
     InvalidOptions,
     InvalidRequest,
     MissingDependency,
-    ServerBusy,
     TooFewPoints,
     TooManyBytes,
     UnknownFormat,
@@ -156,10 +147,12 @@ def test_what_can_be_known_here_is_refused_before_anything_is_sent() -> None:
     with Client("http://127.0.0.1:1") as client:
         with pytest.raises(InvalidOptions):
             client.denoise(sphere(100), iterations=0)
-        with pytest.raises(InvalidCloud, match=r"\(3, 100\)"):
+        with pytest.raises(InvalidCloud, match=r"\(3, 100\).*transpose"):
             client.denoise(sphere(100).T)
         with pytest.raises(FileNotFoundError):
             client.denoise("no-such-file.ply")
+        with pytest.raises(FileNotFoundError, match="of a pipe, give its bytes"):
+            client.denoise("/dev/null")
         with pytest.raises(InvalidRequest, match="give its bytes"):
             client.denoise(io.BytesIO(b"x"))
 
@@ -208,154 +201,6 @@ def test_an_open3d_cloud_comes_back_as_one(client: Client, monkeypatch: pytest.M
     assert clean.points.shape == (POINTS, 3)
 
 
-@contextmanager
-def answering(*answers: bytes) -> Iterator[tuple[str, list[bytes]]]:
-    """Serve one canned answer a connection; b"" hangs up without one. Collects the requests' heads."""
-    heads: list[bytes] = []
-
-    def run(listener: socket.socket) -> None:
-        for answer in answers:
-            connection, _ = listener.accept()
-            with connection:
-                heads.append(connection.recv(65536))
-                connection.sendall(answer)
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=run, args=(listener,), daemon=True)
-        thread.start()
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}", heads
-        thread.join(timeout=5)
-
-
-def canned(status: str, body: str, *headers: str) -> bytes:
-    head = [f"HTTP/1.1 {status}", f"Content-Length: {len(body)}", "Connection: close", *headers]
-    return ("\r\n".join(head) + "\r\n\r\n" + body).encode()
-
-
-HEALTHY = canned("200 OK", '{"status":"ok","ready":true,"new":1}')
-BUSY = canned("503 Service Unavailable", '{"code":"server_busy","detail":"full","retryable":true}', "Retry-After: 0.2")
-
-
-def test_a_busy_server_is_asked_again_after_the_time_it_names() -> None:
-    with answering(BUSY, HEALTHY) as (url, heads), Client(url, api_key="secret") as client:
-        began = time.monotonic()
-        assert client.health().ready
-        assert time.monotonic() - began >= 0.2
-        assert len(heads) == 2
-        assert b"authorization: bearer secret" in heads[0].lower()
-
-
-def test_a_connection_that_breaks_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
-    with answering(b"", HEALTHY) as (url, heads), Client(url) as client:
-        assert client.health().ready
-        assert len(heads) == 2
-
-
-def test_a_server_that_answered_and_is_gone_is_asked_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
-    broken = [b""] * 5
-    with answering(HEALTHY, *broken, HEALTHY) as (url, heads), Client(url, max_retries=1) as client:
-        assert client.health().ready
-        assert client.health().ready
-        assert len(heads) == 7
-    with answering(HEALTHY, b"") as (url, heads), Client(url, max_retries=0) as client:
-        assert client.health().ready
-        with pytest.raises(ConnectionFailed):
-            client.health()
-        assert len(heads) == 2
-
-
-@pytest.mark.parametrize("status", ["502 Bad Gateway", "503 Service Unavailable", "504 Gateway Timeout"])
-def test_a_proxy_whose_server_is_gone_is_asked_on(status: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
-    gone = canned(status, "<html>proxy</html>")
-    with answering(HEALTHY, *[gone] * 3, HEALTHY) as (url, heads), Client(url, max_retries=1) as client:
-        assert client.health().ready
-        assert client.health().ready
-        assert len(heads) == 5
-    with answering(gone, gone) as (url, heads), Client(url, max_retries=1) as client:
-        with pytest.raises(ConnectionFailed, match=status):
-            client.health()
-        assert len(heads) == 2
-
-
-def test_it_is_asked_for_no_longer_than_silence_is_borne_and_uploads_are_counted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = iter(range(0, 1000, 4))
-    monkeypatch.setattr(transport, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-    for body, most in ((None, 14), (b"cloud", 1)):
-        call = Call(method="PUT", path="/", rpc="", body=body)
-        attempts = Attempts(call, Body(), max_retries=1, patience=60.0)
-        attempts.failure = retry.Failure(error=ConnectionFailed("refused"), retryable=True)
-        for _ in range(most):
-            assert attempts.delay() > 0
-        with pytest.raises(ConnectionFailed):
-            attempts.delay()
-
-
-def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    with answering(BUSY, BUSY) as (url, _), Client(url, max_retries=1) as client, pytest.raises(ServerBusy):
-        client.health()
-    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
-    with Client("http://127.0.0.1:1") as client, pytest.raises(ConnectionFailed, match=r"127\.0\.0\.1:1"):
-        client.health()
-
-
-def test_an_error_that_would_only_come_again_is_not_retried() -> None:
-    missing = canned("503 Service Unavailable", '{"code":"device_unavailable","retryable":false}')
-    for answer, kind in ((missing, Exception), (canned("500 Oh No", "<html>proxy</html>"), InternalError)):
-        with answering(answer) as (url, heads), Client(url) as client:
-            with pytest.raises(kind):
-                client.health()
-            assert len(heads) == 1
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        "http://127.0.0.1:80a0", "http://256.1.1.1", "http://127.0.0.1:99999", "grpc://127.0.0.1:99999", "http://[::1",
-        "http://", "ftp://host", "host:8000", "http://host/?x=1", "grpc://host", "grpc://host:1/path", "grpc://u@host:1",
-    ],
-)  # fmt: skip
-def test_a_url_that_cannot_be_is_refused_at_once(url: str) -> None:
-    with pytest.raises(InvalidOptions, match="is no address"):
-        Client(url)
-    with pytest.raises(InvalidOptions, match="is no address"):
-        AsyncClient(url)
-
-
-def test_a_url_may_have_a_large_scheme_and_slashes_at_its_end() -> None:
-    with answering(HEALTHY) as (url, heads), Client(url.replace("http", "HTTP") + "//") as client:
-        assert client.health().ready
-    assert heads[0].startswith(b"GET /healthz ")
-
-
-def test_a_password_in_a_url_is_never_shown() -> None:
-    for url in ("http://user:secret@127.0.0.1:1", "http://user:secret@127.0.0.1:1?x=1"):
-        with pytest.raises((ConnectionFailed, InvalidOptions), match=r"//127\.0\.0\.1:1") as found:
-            Client(url, max_retries=0).health()
-        assert "secret" not in str(found.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "kind"),
-    [
-        ("ALL_PROXY", "socks5://127.0.0.1:1", MissingDependency),
-        ("HTTP_PROXY", "ftp://127.0.0.1:1", InvalidOptions),
-        ("SSL_CERT_FILE", "/nowhere/certificates.pem", InvalidOptions),
-    ],
-)
-def test_an_environment_that_cannot_be_used_is_named(
-    name: str, value: str, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(name, value)
-    for make in (Client, AsyncClient):
-        with pytest.raises(kind, match=name):
-            make("http://127.0.0.1:1")
-
-
 def test_arrays_of_every_kind_are_sent_as_numbers_that_a_server_reads() -> None:
     def sent(source: object) -> np.ndarray:
         call = upload_call(source, iterations=1, seed=0, strength=1.0, format=None)
@@ -367,49 +212,12 @@ def test_arrays_of_every_kind_are_sent_as_numbers_that_a_server_reads() -> None:
     np.testing.assert_array_equal(sent(masked), np.array([[1, 1, 1], [np.nan, 1, 1]], dtype=np.float32))
     assert sent(np.ones((2, 3), dtype=np.longdouble)).dtype == np.float64
     assert sent([[1, 2, 3], [4, 5, 6]]).dtype == np.float64
-    with pytest.raises(InvalidCloud):
-        sent([[1, 2, 3], [4, 5]])
-
-
-def test_a_client_that_is_closed_says_so() -> None:
-    async def ask_closed(url: str) -> None:
-        client = AsyncClient(url)
-        await client.aclose()
-        await client.health()
-
-    for url in ("http://127.0.0.1:1", "grpc://127.0.0.1:1"):
-        client = Client(url)
-        client.close()
-        client.close()
-        with pytest.raises(InvalidRequest, match="closed"):
-            client.health()
-        with pytest.raises(InvalidRequest, match="closed"):
-            asyncio.run(ask_closed(url))
+    for wrong, text in (([[1, 2, 3], [4, 5]], "inhomogeneous"), ((row for row in [[1, 2, 3]]), "got a generator")):
+        with pytest.raises(InvalidCloud, match=text):
+            sent(wrong)
 
 
 def test_an_open3d_cloud_without_open3d_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingDependency, match=r"straightpcf\[open3d\]"):
         sdk.Denoised(job=SimpleNamespace(), request_id="", content=b"").to_open3d()  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("key", ["", " secret", "secret "])
-def test_a_key_that_no_header_keeps_is_refused_at_once(key: str) -> None:
-    with pytest.raises(InvalidOptions, match="API key"):
-        Client("http://127.0.0.1:8000", api_key=key)
-
-
-def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
-    moved = canned("301 Moved Permanently", "", "Location: https://clouds.example/healthz")
-    refused = pytest.raises(InvalidRequest, match=r"https://clouds\.example/healthz")
-    with answering(moved) as (url, _), Client(url) as client, refused:
-        client.health()
-
-
-def test_delays_grow_stay_bounded_and_follow_the_server() -> None:
-    failure = retry.Failure(error=ServerBusy("full"), retryable=True)
-    delays = [retry.next_delay(failure, attempt=n, max_retries=9) or 0.0 for n in range(9)]
-    assert delays[0] < delays[2] < delays[4] <= retry.MAX_DELAY_SECONDS * 1.25
-    assert retry.next_delay(failure, attempt=9, max_retries=9) is None
-    told = retry.Failure(error=ServerBusy("full"), retryable=True, retry_after=10_000.0)
-    assert retry.next_delay(told, attempt=0) == retry.MAX_RETRY_AFTER_SECONDS

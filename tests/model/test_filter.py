@@ -158,6 +158,20 @@ def test_numbers_of_any_type_are_taken(tiny: Filter) -> None:
     assert tiny.denoise((1000 * single).astype(np.int64), ONE_PASS).xyz.shape == (300, 3)
 
 
+def test_masked_points_pass_through_as_nan_ones_do(tiny: Filter) -> None:
+    xyz = np.vstack([noisy(torus(300), 0.01), np.full((1, 3), 1e20)])
+    result = tiny.denoise(np.ma.masked_greater(xyz, 1e19), ONE_PASS)
+    assert result.untouched == 1
+    np.testing.assert_array_equal(result.xyz, tiny.denoise(np.where(xyz > 1e19, np.nan, xyz), ONE_PASS).xyz)
+
+
+def test_a_tensor_that_is_no_array_is_refused_with_torchs_reason(tiny: Filter) -> None:
+    tensor = torch.from_numpy(torus(100))
+    for bad in (tensor.requires_grad_(), tensor.bfloat16()):
+        with pytest.raises(InvalidCloud, match="numbers: "):
+            tiny.denoise(bad)
+
+
 @pytest.mark.parametrize(
     "bad", [np.zeros((100, 2)), np.zeros(300), np.full((100, 3), "a"), np.zeros((100, 3), complex)]
 )

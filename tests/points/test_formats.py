@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 from contextlib import suppress
 from pathlib import Path
 
@@ -164,6 +167,15 @@ def test_a_suffix_that_the_bytes_belie_is_told_so(tmp_path: Path) -> None:
     (path := tmp_path / "scan.ply").write_bytes(b"<html>")
     with pytest.raises(UnknownFormat, match=r"scan\.ply begins with b'<html>'.* no ply file"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("name", ["a.ply.gz", "a.ply", "a.xyz", "a.bin", "a"])
+def test_a_packed_file_is_said_to_be_one_whatever_it_is_called(name: str, tmp_path: Path) -> None:
+    table = b"1 2 3\n" * 100
+    for packed, by in ((gzip.compress(table), "gzip"), (bz2.compress(table), "bzip2"), (lzma.compress(table), "xz")):
+        (path := tmp_path / name).write_bytes(packed)
+        with pytest.raises(UnknownFormat, match=f"packed with {by}: unpack it first"):
+            read_cloud(path)
 
 
 def test_a_name_of_any_length_keeps_its_suffix(tmp_path: Path) -> None:

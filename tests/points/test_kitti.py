@@ -91,6 +91,12 @@ def test_rows_of_other_than_four_numbers_are_refused_saying_what_is_expected(col
         read_cloud(path)
 
 
+def test_text_is_no_frame(tmp_path: Path) -> None:
+    (path := tmp_path / "cloud.bin").write_bytes(b"1.0 2.0 3.0 4.0\n" * N)
+    with pytest.raises(UnsupportedCloud, match=r"this is text: call it \.xyz"):
+        read_cloud(path)
+
+
 @pytest.mark.parametrize(("value", "is_one"), [(0.5, True), (255, True), (-0.5, False), (np.nan, False)])
 def test_an_intensity_that_no_frame_has_is_left_behind(value: float, is_one: bool, frame: Path) -> None:
     cloud, format = read_cloud(frame)

@@ -51,6 +51,14 @@ def test_moved_points_keep_their_wave_packets(point_format: int, suffix: str, tm
         assert again.attributes[name].tobytes() == values.tobytes(), name
 
 
+def test_points_that_only_the_count_of_before_1_4_counts_are_read(tmp_path: Path) -> None:
+    raw = bytearray(_waveform_file(path := tmp_path / "a.las", 9, is_noise=False).read_bytes())
+    struct.pack_into("<I", raw, 107, N)
+    struct.pack_into("<Q", raw, 247, 0)
+    path.write_bytes(raw)
+    assert len(read_cloud(path)[0]) == N
+
+
 @pytest.mark.parametrize("point_format", [9, 10])
 def test_what_lazrs_cannot_pack_without_loss_is_refused_as_laz_and_kept_as_las(
     point_format: int, tmp_path: Path

@@ -144,6 +144,12 @@ def _declaring(shape: str, descr: str = "'<f8'", fortran: str = "False") -> byte
     return _npy_header(f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}}}\n")
 
 
+def _zipped(name: str) -> bytes:
+    with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:
+        archive.writestr(name, "ply")
+    return buffer.getvalue()
+
+
 def _altered(raw: bytes) -> bytes:
     """Damage the packed bytes of the first member."""
     at = raw.index(b"points.npy") + 60
@@ -170,6 +176,10 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "records of no type": (_declaring("(5,)", "[('x', 'f4'), ('y', 'hello'), 3]"), UnsupportedCloud, "hello"),
     "structured": (npy(np.zeros(5, [("x", "f4"), ("y", "f4")])), UnsupportedCloud, "x"),
     "two columns": (npy(np.zeros((5, 2))), UnsupportedCloud, r"\(5, 2\)"),
+    "a point a column": (npy(torus(50).T), UnsupportedCloud, r"\(3, 50\).*transpose"),
+    "very many points, each a column": (_declaring("(4, 5000)"), UnsupportedCloud, r"\(4, 5000\).*transpose"),
+    "a point a column of an archive": (npz(points=np.zeros((6, 50))), UnsupportedCloud, r"points\.npy.*transpose"),
+    "an image of points": (npy(np.zeros((4, 5, 3))), UnsupportedCloud, r"\(4, 5, 3\).*reshape\(-1, 3\)"),
     "three dimensions": (npy(np.zeros((5, 3, 3))), UnsupportedCloud, r"\(5, 3, 3\)"),
     "truncated": (npy(np.zeros((5, 3)))[:-1], MalformedFile, "120 bytes.* 119"),
     "no header": (b"\x93NUMPY\x01\x00", MalformedFile, "header"),
@@ -186,7 +196,8 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "no zip": (b"PK\x03\x04" + bytes(200), MalformedFile, "NPZ"),
     "truncated zip": (npz(points=torus(50))[:-30], MalformedFile, "NPZ"),
     "damaged zip": (_altered(npz(points=torus(50))), MalformedFile, "NPZ"),
-    "no arrays": (npz(), UnsupportedCloud, "no arrays"),
+    "no arrays": (npz(), UnsupportedCloud, "no arrays.*but nothing"),
+    "a zip of another file": (_zipped("scan.ply"), UnsupportedCloud, r"no arrays.*but scan\.ply: unpack it"),
     "no positions": (npz(label=np.arange(5)), UnsupportedCloud, "label"),
     "normals alone": (npz(normals=np.ones((5, 3))), UnsupportedCloud, "0 arrays.*normals"),
     "two candidates": (npz(a=np.zeros((5, 3)), b=np.zeros((5, 3))), UnsupportedCloud, "2 arrays.*a, b"),
