@@ -14,6 +14,9 @@ from straightpcf.points.errors import MalformedFile
 __all__ = ["Calibration"]
 
 _ONE_PASS_DISTANCE = 0.8  # d of noise that one pass takes most of
+# As `stuck`, where walls close together were seen at the start: of points that lie by chance a second pass would join
+# them, of even points, of whose d the first leaves less, it does good.
+_STUCK_BETWEEN_WALLS = 0.61
 
 
 @dataclass(frozen=True)
@@ -69,14 +72,16 @@ class Calibration:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
 
-    def passes_left(self, distances: Sequence[float], noise_in_radii: float = 0.0) -> int:
+    def passes_left(self, distances: Sequence[float], noise_in_radii: float = 0.0, *, thin_walls: bool = False) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
-        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`.
+        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`;
+        thin_walls: whether points seemed to be on walls close together before the first pass.
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
-        if done == 1 < due and start < _ONE_PASS_DISTANCE and now > self.stuck * start:
+        stuck = min(self.stuck, _STUCK_BETWEEN_WALLS) if thin_walls else self.stuck
+        if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
         if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:

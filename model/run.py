@@ -176,7 +176,9 @@ class Run:
             return planned - self.iterations
         if len(self.points.xyz) < _FEW_POINTS:
             return 1 - self.iterations
-        return self.filter.calibration.passes_left(self.distances, self.readings[0].noise_in_radii)
+        first = self.readings[0]
+        thin_walls = first.sampling.thin_walls
+        return self.filter.calibration.passes_left(self.distances, first.noise_in_radii, thin_walls=thin_walls)
 
     def _spread_step(
         self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None

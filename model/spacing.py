@@ -52,8 +52,10 @@ class Sampling:
         """
         size, measure = patches.index.shape[1], partial(_PatchStatistics.at, *_looked_at(xyz, patches))
         found = list(mapper(measure, patches.index))
-        irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(np.concatenate([s.areas for s in found]), noise_std)
         thin_walls = has_walls([s.between_walls for s in found])
+        areas = np.concatenate([s.areas for s in found])
+        # Where walls were read as noise nothing tells, and evening out points that lie by chance costs more.
+        irregular = size >= _LEAST_PATCH_POINTS and (thin_walls or _is_irregular(areas, noise_std))
         return cls(irregular, low_noise_weight([s.noise for s in found]), thin_walls)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
+from straightpcf.model.noise import Reading
 from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_table", "passes", "trace"]
@@ -42,7 +43,7 @@ class Trace:
     """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on.
 
     noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it;
-    noise_in_radii: of a patch, what was read at the start.
+    noise_in_radii, thin_walls: of a patch, and of the cloud, what was read at the start.
     """
 
     cloud: str
@@ -51,6 +52,7 @@ class Trace:
     chamfer: tuple[float, ...]
     noise_type: str = "gaussian"
     noise_in_radii: float = 0.0
+    thin_walls: bool = False
 
     @property
     def level(self) -> tuple[str, str, float]:
@@ -67,24 +69,23 @@ def trace(
     noise_type: str = "gaussian",
 ) -> Trace:
     """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
-    states, distances, in_radii = every_pass(filter_, noisy)
+    states, distances, first = every_pass(filter_, noisy)
     chamfer = tuple(chamfer_distance(x, clean) for x in states)
-    return Trace(name, noise_std, distances, chamfer, noise_type, in_radii)
+    return Trace(name, noise_std, distances, chamfer, noise_type, first.noise_in_radii, first.sampling.thin_walls)
 
 
 def every_pass(
     filter_: Filter, noisy: npt.NDArray[np.float64], *, seed: int = 0
-) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...], float]:
+) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...], Reading]:
     """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and what it goes by.
 
-    That is d before each pass and after the last, and the noise at the start in radii of a patch. As many passes as
-    `calibrate` knows of.
+    That is d before each pass and after the last, and the reading at the start. As many passes as `calibrate` knows of.
     """
     run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"]), seed=seed))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
-    return list(states.values()), run.distances, run.readings[0].noise_in_radii
+    return list(states.values()), run.distances, run.readings[0]
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
@@ -136,7 +137,8 @@ def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
     while done + 1 < len(recorded.distances):
-        if not calibration.passes_left(recorded.distances[: done + 1], recorded.noise_in_radii):
+        so_far, thin_walls = recorded.distances[: done + 1], recorded.thin_walls
+        if not calibration.passes_left(so_far, recorded.noise_in_radii, thin_walls=thin_walls):
             break
         done += 1
     return done

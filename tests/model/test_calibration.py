@@ -51,6 +51,14 @@ def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> 
     assert passes(Calibration(crowded=1.0), dense) == 2
 
 
+def test_between_walls_a_second_pass_is_made_only_after_a_first_that_took_much() -> None:
+    twice = Calibration(starts=(0.45,), polish=(), settled=())
+    for now, made in ((0.43, 1), (0.38, 2)):
+        distances = (0.66, now, 0.35, 0.35)
+        assert passes(twice, Trace("plain", 0.01, distances, ())) == 2
+        assert passes(twice, Trace("walls", 0.01, distances, (), thin_walls=True)) == made
+
+
 def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
     assert passes(Calibration(starts=(0.45,)), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 1
     nearly_clean = Calibration(starts=(0.45,), polish=(0.22,), settled=(0.18,))  # d of clean clouds is 0.12

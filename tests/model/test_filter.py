@@ -258,7 +258,7 @@ def test_progress_never_falls_and_ends_at_one(
 ) -> None:
     if passes_left is not None:
         foreseen = iter(passes_left)
-        monkeypatch.setattr(type(tiny.calibration), "passes_left", lambda *_: next(foreseen))
+        monkeypatch.setattr(type(tiny.calibration), "passes_left", lambda *_, **__: next(foreseen))
     seen: list[float] = []
     tiny.denoise(noisy(torus(5000), 0.01), DenoiseOptions(iterations=iterations), on_progress=seen.append)
     assert seen == sorted(seen)

@@ -37,6 +37,12 @@ def test_two_walls_are_told_from_one_with_noise(noise_std: float) -> None:
         assert not thin_walls(cloud + 0.04 * ball)
 
 
+def test_points_on_walls_are_not_evened_out_though_the_walls_are_read_as_noise() -> None:
+    for xyz, irregular in ((noisy(plate(2000, 0.04), 0.008), True), (noisy(sphere(2000), 0.008), False)):
+        read = Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.06)  # more than their spacing: nothing tells
+        assert (read.thin_walls, read.irregular) == (irregular, irregular)
+
+
 def test_a_step_that_brings_walls_together_is_told_from_one_within_them() -> None:
     around = noisy(plate(1000, 0.06), 0.005)
     around = around[np.argsort((around**2).sum(axis=1))]
