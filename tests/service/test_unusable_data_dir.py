@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import shutil
 import sqlite3
@@ -15,16 +16,16 @@ from typing import Any
 import httpx2
 import pytest
 
-from straightpcf.points.errors import ServerBusy
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.backends.base import FileJob
-from straightpcf.service.backends.worker import Failed, _answer
+from straightpcf.service.backends.base import FileJob, FilesUnusable
+from straightpcf.service.backends.process import WorkerProcess
+from straightpcf.service.backends.worker import Unusable, WorkerSpec, _answer
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import database
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.store import JobStore
 from tests.service import engines
-from tests.service.fakes import CONTENT, ObedientBackend
+from tests.service.fakes import CONTENT, Deaf, ObedientBackend
 from tests.service.in_process import free_port, serving
 from tests.service.test_races import CLOUD, play, willing
 
@@ -145,10 +146,25 @@ def test_a_worker_whose_files_are_gone_says_so_in_a_line(tmp_path: Path, caplog:
     ours, theirs = Pipe()
     with ours, theirs:
         told: Any = _answer(SimpleNamespace(device="cpu"), job, theirs)  # type: ignore[arg-type]
-    assert isinstance(told, Failed)
-    assert told.code == "server_busy"
+    assert isinstance(told, Unusable)
     assert "job 1: its files cannot be used: [Errno 2] No such file" in told.message
     assert not caplog.records
+
+
+def test_a_real_worker_whose_files_are_gone_lives_on(tmp_path: Path) -> None:
+    job = FileJob(id="1", source=tmp_path / "in", target=tmp_path / "out", options=DenoiseOptions(), max_points=1000)
+
+    async def scenario() -> None:
+        worker = WorkerProcess(WorkerSpec(device="cpu", weights=None, threads=1))
+        try:
+            await worker.ready
+            for _ in range(2):
+                with pytest.raises(FilesUnusable, match="its files cannot be used"):
+                    await worker.run(job, Deaf())
+        finally:
+            await worker.stop(patience_seconds=5)
+
+    asyncio.run(scenario())
 
 
 def test_a_job_whose_files_its_worker_could_not_use_starts_again(tmp_path: Path) -> None:
@@ -160,13 +176,13 @@ def test_a_job_whose_files_its_worker_could_not_use_starts_again(tmp_path: Path)
         assert (record.state, record.attempts) == ("succeeded", 2)
         assert "log" in await engines.kinds(engine, record.id)
 
-    engines.play(tmp_path, scenario, ServerBusy("job 1: its files cannot be used"))
+    engines.play(tmp_path, scenario, FilesUnusable("job 1: its files cannot be used"))
 
 
 def test_a_job_that_another_server_deletes_while_it_is_worked_on_is_no_fault(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    backend = ObedientBackend(ServerBusy("job 1: its files cannot be used"))  # as a worker whose folder is gone says
+    backend = ObedientBackend(FilesUnusable("job 1: its files cannot be used"))  # as a worker whose folder is gone says
     backend.go.set()
 
     async def scenario() -> None:
