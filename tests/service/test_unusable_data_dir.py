@@ -6,6 +6,7 @@ import asyncio
 import errno
 import shutil
 import sqlite3
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from multiprocessing import Pipe
@@ -21,7 +22,7 @@ from straightpcf.service.backends.base import FileJob, FilesUnusable
 from straightpcf.service.backends.process import WorkerProcess
 from straightpcf.service.backends.worker import Unusable, WorkerSpec, _answer
 from straightpcf.service.engine import Engine
-from straightpcf.service.jobs import database
+from straightpcf.service.jobs import store_thread
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.store import JobStore
 from tests.service import engines
@@ -55,7 +56,7 @@ async def locked(folder: Path) -> AsyncIterator[None]:
 def test_who_asks_is_told_so_and_served_when_it_is_over(
     tmp_path: Path, trouble: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(database, "_BUSY_SECONDS", 0.1)
+    monkeypatch.setattr(store_thread, "LOCK_SECONDS", 0.1)
     backend = willing()
 
     async def scenario() -> None:
@@ -80,6 +81,65 @@ def test_who_asks_is_told_so_and_served_when_it_is_over(
 
     play(scenario)
     assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that_it_accepts(
+    tmp_path: Path, replaced: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend, names = willing(), [f"jobs.sqlite3{part}" for part in ("", "-wal", "-shm")]
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path / "data", backend) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            backend.finish.clear()
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            await engines.until(lambda: backend.runs)
+            (away := tmp_path / "away").mkdir()
+            for name in names:
+                (tmp_path / "data" / name).rename(away / name)
+            if replaced:
+                JobStore(tmp_path / "data" / "jobs.sqlite3").close()
+            ready = await http.get("/readyz")
+            assert (ready.status_code, ready.json()) == (503, {"status": "no_database", "ready": False})
+            refused = await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)
+            assert (refused.status_code, refused.json()["detail"]) == (503, SAID)
+            assert not list((tmp_path / "data" / "incoming").iterdir())
+            for name in names:
+                (away / name).rename(tmp_path / "data" / name)
+            backend.finish.set()
+            assert (await http.get("/readyz")).status_code == 200
+            assert (await http.get("/jobs/before?wait=10")).json()["state"] == "succeeded"
+            (tmp_path / "data" / "jobs.sqlite3").unlink()  # for good: the server still ends in peace
+
+    play(scenario)
+    assert "deleted or replaced under this server" in caplog.text
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_many_requests_do_not_wait_for_a_lock_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store_thread, "LOCK_SECONDS", 1.0)
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}", timeout=60) as http,
+        ):
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            async with locked(tmp_path / "data"):
+                began = time.monotonic()
+                asked = [http.put(f"/jobs/{number}?filename=a.xyz", content=CLOUD) for number in range(20)]
+                *answers, seen = await asyncio.gather(*asked, http.get("/jobs/before"))
+                assert time.monotonic() - began < 10
+            assert {answer.status_code for answer in answers} == {503}
+            assert all(answer.headers["retry-after"] for answer in answers)
+            assert seen.status_code == 200
+
+    play(scenario)
 
 
 def test_grpc_says_it_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
