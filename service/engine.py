@@ -6,15 +6,12 @@ import asyncio
 import hashlib
 import json
 import logging
-import sqlite3
 import time
 import uuid
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncGenerator, AsyncIterator, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Concatenate, ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
 from straightpcf.points.errors import InvalidRequest, JobExpired, JobNotFinished, NotFound, ServerBusy
@@ -24,10 +21,11 @@ from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE
 from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.jobs.folders import JobFolders, digest_of
-from straightpcf.service.jobs.full_disk import full_disk_as_spool_full, is_full, keep_reserve, release_reserve
+from straightpcf.service.jobs.full_disk import keep_reserve
 from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState, NewJob
 from straightpcf.service.jobs.runner import JobRunner
 from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.jobs.store_thread import StoreThread
 from straightpcf.service.jobs.sweeper import Sweeper
 
 __all__ = ["Engine", "JobRequest", "Usage"]
@@ -37,11 +35,6 @@ POLL_SECONDS = 1.0
 # Who still waits when a server ends is answered so long before what runs is cut off.
 FAREWELL_SECONDS = 1.5 * POLL_SECONDS
 CHUNK_BYTES = 2**20
-# What ends or deletes jobs, and so may take the reserve of a full disk.
-_MAKES_ROOM = frozenset[object]({JobStore.delete, JobStore.fail, JobStore.recover, JobStore.request_cancel})
-
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
 
 logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
 
@@ -81,9 +74,8 @@ class Engine:
         self.limits = limits
         self._ends_at: float | None = None  # time.monotonic(), once it drains
         self._data_dir = data_dir
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="job-store")  # SQLite blocks, the event loop must not
+        self._call = StoreThread(data_dir)
         self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
-        self._store: JobStore
         self._folders: JobFolders
         self._runner: JobRunner
         self._sweeper: Sweeper
@@ -91,7 +83,12 @@ class Engine:
     @property
     def ready(self) -> bool:
         """Tell whether a job that is submitted now finds a warm worker."""
-        return bool(self.backend.devices) and not self.draining
+        return bool(self.backend.devices) and not self.draining and self.in_place
+
+    @property
+    def in_place(self) -> bool:
+        """Tell whether the store's file is still there, for what is written to one that was deleted is lost."""
+        return self._call.in_place
 
     @property
     def ending(self) -> bool:
@@ -101,9 +98,7 @@ class Engine:
     async def start(self) -> None:
         """Open the store, take back what dead servers left, and begin to start the backend; `ready` says when it is."""
         self._folders = await asyncio.to_thread(JobFolders, self._data_dir)
-        self._store = await asyncio.get_running_loop().run_in_executor(
-            self._thread, JobStore, self._data_dir / "jobs.sqlite3", self._folders.job_bytes
-        )
+        await self._call.open(self._folders.job_bytes)
         self._runner = JobRunner(
             self.backend, folders=self._folders, call=self._call, notify=self._notify,
             max_points=self.limits.max_points, result_ttl_seconds=self.limits.result_ttl_seconds,
@@ -141,8 +136,7 @@ class Engine:
         await self._sweeper.stop()
         await self._runner.stop(lambda: self.patience_seconds)
         await self.backend.stop()
-        await self._call(JobStore.close)
-        self._thread.shutdown()
+        await self._call.close()
         self._folders.close()
 
     # --- taking jobs
@@ -335,23 +329,6 @@ class Engine:
         self._notify(id)
 
     # --- inside
-
-    async def _call(self, function: Callable[Concatenate[JobStore, _P], _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        """Run one store transaction on the store's thread; it is carried out even if the caller is cancelled.
-
-        Raises SpoolFull where the disk is full; what makes room there takes the reserve.
-        """
-
-        def carry_out() -> _T:
-            try:
-                return function(self._store, *args, **kwargs)
-            except sqlite3.Error as exc:
-                if not (function in _MAKES_ROOM and is_full(exc) and release_reserve(self._data_dir)):
-                    raise
-                return function(self._store, *args, **kwargs)
-
-        with full_disk_as_spool_full():
-            return await asyncio.get_running_loop().run_in_executor(self._thread, carry_out)
 
     async def _same(self, id: str, owner: str, folder: str | None) -> JobRecord:
         """Return a job as it is; raises NotFound where it is not the one of that folder any more, if one is given."""

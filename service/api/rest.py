@@ -118,9 +118,12 @@ async def health(request: Request) -> Health:
     "/readyz", summary="Is a worker warm", response_model=Health, responses={503: {"model": Health}, **MISDIRECTED}
 )
 async def ready(request: Request) -> JSONResponse:
-    """Answer 200 once the weights are loaded and a first cloud went through them, 503 before, and once it drains."""
+    """Answer 200 once the weights are loaded and a first cloud went through them; 503 before, once it drains, and while
+    its database is gone.
+    """
     engine: Engine = request.app.state.engine
-    status = "ok" if engine.ready else "draining" if engine.draining else "starting"
+    lost = "starting" if engine.in_place else "no_database"
+    status = "ok" if engine.ready else "draining" if engine.draining else lost
     health = Health(status=status, ready=engine.ready)
     return JSONResponse(health.model_dump(), status_code=200 if engine.ready else 503)
 

@@ -10,7 +10,7 @@ from typing import Protocol
 from straightpcf.points.errors import StraightPCFError
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["Backend", "FileJob", "FileReport", "Listener", "WorkerDied"]
+__all__ = ["Backend", "FileJob", "FileReport", "FilesUnusable", "Listener", "WorkerDied"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,10 @@ class WorkerDied(Exception):  # noqa: N818 - an event, never shown to a user
     """Report a worker that ended without an answer (killed, out of memory, a crash in native code)."""
 
 
+class FilesUnusable(Exception):  # noqa: N818 - likewise
+    """Report a worker that could not read or write a job's files (a disk that fails, is gone or read-only)."""
+
+
 class Listener(Protocol):
     """Hear of one job while it runs; called on the event loop, must not block."""
 
@@ -107,7 +111,7 @@ class Backend(Protocol):
         """Return as soon as a worker is warm and free; raises `failure`."""
 
     async def run(self, job: FileJob, listener: Listener) -> FileReport:
-        """Wait for a worker and run the job once; raises StraightPCFError, WorkerDied.
+        """Wait for a worker and run the job once; raises StraightPCFError, WorkerDied, FilesUnusable.
 
         Cancelling the awaiting task cancels the work; the call returns within a second, when nothing works on it.
         """

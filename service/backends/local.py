@@ -66,7 +66,7 @@ class LocalBackend:
         self._idle.put_nowait(await self._claim())
 
     async def run(self, job: FileJob, listener: Listener) -> FileReport:
-        """Run a job on the first worker that is free; raises its error, or WorkerDied."""
+        """Run a job on the first worker that is free; raises its error, WorkerDied or FilesUnusable."""
         worker = await self._claim()
         try:
             listener.on_start(self._warm.get(worker, ""))

@@ -9,7 +9,7 @@ from typing import Any
 
 from straightpcf.model.children import signals_kept
 from straightpcf.points.errors import ERRORS_BY_CODE, InternalError
-from straightpcf.service.backends.base import FileJob, FileReport, Listener, WorkerDied
+from straightpcf.service.backends.base import FileJob, FileReport, FilesUnusable, Listener, WorkerDied
 from straightpcf.service.backends.worker import (
     SERVERS_OWN,
     Cancel,
@@ -18,6 +18,7 @@ from straightpcf.service.backends.worker import (
     Preview,
     Progress,
     Ready,
+    Unusable,
     WorkerSpec,
     run_worker,
 )
@@ -64,7 +65,10 @@ class WorkerProcess:
         return self._process.pid
 
     async def run(self, job: FileJob, listener: Listener) -> FileReport:
-        """Run one job at a time; raises its error, or WorkerDied. When cancelled, wait until the worker has let go."""
+        """Run one job at a time; raises its error, WorkerDied or FilesUnusable.
+
+        When cancelled, wait until the worker has let go.
+        """
         answer: asyncio.Future[FileReport] = self._loop.create_future()
         self._job, self._answer, self._listener = job, answer, listener
         try:
@@ -123,6 +127,8 @@ class WorkerProcess:
                 self._answer.set_result(report)
             case Failed(job_id, code, text) if self._concerns(job_id) and self._answer is not None:
                 self._answer.set_exception(ERRORS_BY_CODE.get(code, InternalError)(text))
+            case Unusable(job_id, text) if self._concerns(job_id) and self._answer is not None:
+                self._answer.set_exception(FilesUnusable(text))
 
     def _concerns(self, job_id: str | None) -> bool:
         return self._job is not None and self._job.id == job_id and self._answer is not None and not self._answer.done()

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, StraightPCFError, TooLarge
+from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
@@ -20,7 +20,18 @@ from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 if TYPE_CHECKING:
     from straightpcf.model.filter import Filter
 
-__all__ = ["SERVERS_OWN", "Cancel", "Done", "Failed", "Preview", "Progress", "Ready", "WorkerSpec", "run_worker"]
+__all__ = [
+    "SERVERS_OWN",
+    "Cancel",
+    "Done",
+    "Failed",
+    "Preview",
+    "Progress",
+    "Ready",
+    "Unusable",
+    "WorkerSpec",
+    "run_worker",
+]
 
 # Ctrl-C reaches the whole group, and so does what systemd and `timeout` send: the server says when to end.
 SERVERS_OWN = (signal.SIGINT, signal.SIGTERM)
@@ -93,6 +104,14 @@ class Failed:
     message: str
 
 
+@dataclass(frozen=True)
+class Unusable:
+    """Tell that a job's files could not be read or written, which is no fault of the job."""
+
+    job_id: str
+    message: str
+
+
 def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
     """Serve jobs until the pipe says None or its other end is gone."""
     for number in SERVERS_OWN:
@@ -131,7 +150,7 @@ def _load(spec: WorkerSpec) -> Filter:
     return denoiser
 
 
-def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
+def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed | Unusable:
     sent, last_iteration = 0.0, 0
 
     def on_progress(fraction: float, iteration: int) -> None:
@@ -157,7 +176,7 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed:
     except StraightPCFError as error:
         return Failed(job.id, error.code, error.message)
     except OSError as error:  # its folder is read-only, or gone: where another server deletes the job, too
-        return Failed(job.id, ServerBusy.code, f"job {job.id}: its files cannot be used: {error}")
+        return Unusable(job.id, f"job {job.id}: its files cannot be used: {error}")
     except Exception as error:
         from straightpcf.model.device import is_lost
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -12,13 +13,34 @@ from pathlib import Path
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.service.jobs.full_disk import is_full, release_reserve
 
-__all__ = ["check_database", "open_database", "transaction"]
+__all__ = ["OpenedFile", "check_database", "open_database", "transaction"]
 
 SCHEMA_VERSION = 1
-_BUSY_SECONDS = 30.0
+_BUSY_SECONDS = 30.0  # while it is opened: of several servers that start at once, one upgrades it
 # Every upload asks again and again for what is kept, beside the rows of all that has expired. Of a column that may have
 # to come first.
 _KEPT = "CREATE INDEX IF NOT EXISTS jobs_kept ON jobs (owner, spool) WHERE state <> 'expired'"
+
+
+class OpenedFile:
+    """Remember which file was opened: SQLite goes on writing to one that was deleted or replaced, and it is lost."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._opened = path, path.stat()
+
+    @property
+    def in_place(self) -> bool:
+        """Tell whether it is still there."""
+        try:
+            return os.path.samestat(self._path.stat(), self._opened)
+        except OSError:
+            return False
+
+    def check(self) -> None:
+        """Raise OSError if it is not."""
+        if not self.in_place:
+            told = "deleted or replaced under this server: put it back, or restart the server and its jobs are lost"
+            raise OSError(errno.ESTALE, told, str(self._path))
 
 
 def check_database(path: Path) -> None:

@@ -10,9 +10,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Any, Literal, Protocol
 
-from straightpcf.points.errors import InternalError, JobCanceled, ServerBusy, StraightPCFError
+from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError
 from straightpcf.points.formats import format_named
-from straightpcf.service.backends.base import Backend, FileJob, FileReport, WorkerDied
+from straightpcf.service.backends.base import Backend, FileJob, FileReport, FilesUnusable, WorkerDied
 from straightpcf.service.jobs.folders import INPUT, JobFolders
 from straightpcf.service.jobs.full_disk import DISK_TROUBLES
 from straightpcf.service.jobs.record import Claim, EventKind, ResultInfo
@@ -191,7 +191,7 @@ class JobRunner:
                 await self._deliver(claim, running.task.result())
             case WorkerDied() as death:
                 await self._after_death(claim, death, "its worker died")
-            case ServerBusy(code=ServerBusy.code) as trouble:  # and no kind of it: a full disk is said
+            case FilesUnusable() as trouble:
                 await self._after_death(claim, trouble, "its worker could not use its files")
             case StraightPCFError() as error:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))

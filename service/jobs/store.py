@@ -45,6 +45,7 @@ __all__ = ["JobStore"]
 
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+_ENDED: tuple[JobState, ...] = tuple(sorted(FINISHED - {"expired"}))
 _DETAIL = 1000  # characters of what a job failed of that are kept: what a file says may be in it
 _PASSING: tuple[EventKind, ...] = ("preview", "progress")
 Hold = Literal["held", "canceled", "lost"]
@@ -64,6 +65,10 @@ class JobStore:
     def close(self) -> None:
         """Close the file."""
         self._db.close()
+
+    def wait_for_locks(self, seconds: float) -> None:
+        """Let the next method wait at most so long for other processes."""
+        self._db.execute(f"PRAGMA busy_timeout = {int(1000 * seconds)}")
 
     # --- what clients ask for
 
@@ -259,7 +264,7 @@ class JobStore:
 
     def over(self) -> list[str]:
         """Name the folders of what is over its time, and not marked so; writes nothing."""
-        query = f"SELECT folder FROM jobs WHERE state IN {_finished()} AND expires_at < ?"
+        query = f"SELECT folder FROM jobs WHERE state IN {_ENDED} AND expires_at < ?"
         return [row["folder"] for row in self._db.execute(query, (time.time(),))]
 
     def expire(self, *, rows_after: float) -> list[str]:
@@ -270,8 +275,7 @@ class JobStore:
         with self._transaction():
             now = time.time()
             query = (
-                f"UPDATE jobs SET state = 'expired' WHERE state IN {_finished()} AND expires_at < ?"
-                " RETURNING seq, folder"
+                f"UPDATE jobs SET state = 'expired' WHERE state IN {_ENDED} AND expires_at < ? RETURNING seq, folder"
             )
             expired = self._db.execute(query, (now,)).fetchall()
             query = f"DELETE FROM events WHERE job = ? AND kind IN {_PASSING}"
@@ -384,10 +388,6 @@ def _error(saved: dict[str, str]) -> StraightPCFError:
 
 def _canceled(id: str) -> dict[str, str]:
     return {"code": "job_canceled", "detail": f"job {id} was canceled"}
-
-
-def _finished() -> str:
-    return str(tuple(sorted(FINISHED - {"expired"})))
 
 
 def _time(seconds: float) -> datetime:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import shutil
 import sqlite3
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from multiprocessing import Pipe
@@ -15,16 +17,16 @@ from typing import Any
 import httpx2
 import pytest
 
-from straightpcf.points.errors import ServerBusy
 from straightpcf.points.options import DenoiseOptions
-from straightpcf.service.backends.base import FileJob
-from straightpcf.service.backends.worker import Failed, _answer
+from straightpcf.service.backends.base import FileJob, FilesUnusable
+from straightpcf.service.backends.process import WorkerProcess
+from straightpcf.service.backends.worker import Unusable, WorkerSpec, _answer
 from straightpcf.service.engine import Engine
-from straightpcf.service.jobs import database
+from straightpcf.service.jobs import store_thread
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.store import JobStore
 from tests.service import engines
-from tests.service.fakes import CONTENT, ObedientBackend
+from tests.service.fakes import CONTENT, Deaf, ObedientBackend
 from tests.service.in_process import free_port, serving
 from tests.service.test_races import CLOUD, play, willing
 
@@ -54,7 +56,7 @@ async def locked(folder: Path) -> AsyncIterator[None]:
 def test_who_asks_is_told_so_and_served_when_it_is_over(
     tmp_path: Path, trouble: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(database, "_BUSY_SECONDS", 0.1)
+    monkeypatch.setattr(store_thread, "LOCK_SECONDS", 0.1)
     backend = willing()
 
     async def scenario() -> None:
@@ -79,6 +81,65 @@ def test_who_asks_is_told_so_and_served_when_it_is_over(
 
     play(scenario)
     assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that_it_accepts(
+    tmp_path: Path, replaced: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend, names = willing(), [f"jobs.sqlite3{part}" for part in ("", "-wal", "-shm")]
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path / "data", backend) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            backend.finish.clear()
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            await engines.until(lambda: backend.runs)
+            (away := tmp_path / "away").mkdir()
+            for name in names:
+                (tmp_path / "data" / name).rename(away / name)
+            if replaced:
+                JobStore(tmp_path / "data" / "jobs.sqlite3").close()
+            ready = await http.get("/readyz")
+            assert (ready.status_code, ready.json()) == (503, {"status": "no_database", "ready": False})
+            refused = await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)
+            assert (refused.status_code, refused.json()["detail"]) == (503, SAID)
+            assert not list((tmp_path / "data" / "incoming").iterdir())
+            for name in names:
+                (away / name).rename(tmp_path / "data" / name)
+            backend.finish.set()
+            assert (await http.get("/readyz")).status_code == 200
+            assert (await http.get("/jobs/before?wait=10")).json()["state"] == "succeeded"
+            (tmp_path / "data" / "jobs.sqlite3").unlink()  # for good: the server still ends in peace
+
+    play(scenario)
+    assert "deleted or replaced under this server" in caplog.text
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_many_requests_do_not_wait_for_a_lock_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store_thread, "LOCK_SECONDS", 1.0)
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}", timeout=60) as http,
+        ):
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            async with locked(tmp_path / "data"):
+                began = time.monotonic()
+                asked = [http.put(f"/jobs/{number}?filename=a.xyz", content=CLOUD) for number in range(20)]
+                *answers, seen = await asyncio.gather(*asked, http.get("/jobs/before"))
+                assert time.monotonic() - began < 10
+            assert {answer.status_code for answer in answers} == {503}
+            assert all(answer.headers["retry-after"] for answer in answers)
+            assert seen.status_code == 200
+
+    play(scenario)
 
 
 def test_grpc_says_it_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -145,10 +206,25 @@ def test_a_worker_whose_files_are_gone_says_so_in_a_line(tmp_path: Path, caplog:
     ours, theirs = Pipe()
     with ours, theirs:
         told: Any = _answer(SimpleNamespace(device="cpu"), job, theirs)  # type: ignore[arg-type]
-    assert isinstance(told, Failed)
-    assert told.code == "server_busy"
+    assert isinstance(told, Unusable)
     assert "job 1: its files cannot be used: [Errno 2] No such file" in told.message
     assert not caplog.records
+
+
+def test_a_real_worker_whose_files_are_gone_lives_on(tmp_path: Path) -> None:
+    job = FileJob(id="1", source=tmp_path / "in", target=tmp_path / "out", options=DenoiseOptions(), max_points=1000)
+
+    async def scenario() -> None:
+        worker = WorkerProcess(WorkerSpec(device="cpu", weights=None, threads=1))
+        try:
+            await worker.ready
+            for _ in range(2):
+                with pytest.raises(FilesUnusable, match="its files cannot be used"):
+                    await worker.run(job, Deaf())
+        finally:
+            await worker.stop(patience_seconds=5)
+
+    asyncio.run(scenario())
 
 
 def test_a_job_whose_files_its_worker_could_not_use_starts_again(tmp_path: Path) -> None:
@@ -160,13 +236,13 @@ def test_a_job_whose_files_its_worker_could_not_use_starts_again(tmp_path: Path)
         assert (record.state, record.attempts) == ("succeeded", 2)
         assert "log" in await engines.kinds(engine, record.id)
 
-    engines.play(tmp_path, scenario, ServerBusy("job 1: its files cannot be used"))
+    engines.play(tmp_path, scenario, FilesUnusable("job 1: its files cannot be used"))
 
 
 def test_a_job_that_another_server_deletes_while_it_is_worked_on_is_no_fault(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    backend = ObedientBackend(ServerBusy("job 1: its files cannot be used"))  # as a worker whose folder is gone says
+    backend = ObedientBackend(FilesUnusable("job 1: its files cannot be used"))  # as a worker whose folder is gone says
     backend.go.set()
 
     async def scenario() -> None:
