@@ -22,6 +22,9 @@ __all__ = ["Sampling"]
 # they were spread evenly. Noise brings the two together: at 0.6 of the spacing to 0.27 and 0.23 (docs/training-log.md).
 _FEW_NEIGHBOURS, _MANY_NEIGHBOURS = 8, 32
 _IRREGULAR_STD, _TELLING_NOISE = 0.25, 0.6
+# Of walls close together half of the 32 are on the other one: 0.13 to 0.18 where points are even, with 1 % of noise,
+# and 0.22 to 0.33 by chance. The noise that is read there is the walls.
+_IRREGULAR_STD_OF_WALLS = 0.2
 # The nearest other's area beside a 32nd of that of 32: 1.4 to 2 where points are even, 0.5 to 1 in lines, in grids of
 # cells of 1 : 2.5 and more, and by chance.
 _LINES_AREA_RATIO = 1.3
@@ -54,8 +57,7 @@ class Sampling:
         found = list(mapper(measure, patches.index))
         thin_walls = has_walls([s.between_walls for s in found])
         areas = np.concatenate([s.areas for s in found])
-        # Where walls were read as noise nothing tells, and evening out points that lie by chance costs more.
-        irregular = size >= _LEAST_PATCH_POINTS and (thin_walls or _is_irregular(areas, noise_std))
+        irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         return cls(irregular, low_noise_weight([s.noise for s in found]), thin_walls)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
@@ -99,13 +101,14 @@ def _between_walls(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.
     return between_walls(_nearest(xyz, samples, whole, rows), uncovered=True)
 
 
-def _is_irregular(areas: Floats, noise_std: float) -> bool:
+def _is_irregular(areas: Floats, noise_std: float, *, thin_walls: bool) -> bool:
     """Say whether points with noise of some std lie by chance, or in lines; areas: (n, 3), as of `_PatchStatistics`.
 
     Where noise is as large as the distance between points nothing tells, and they are taken for even.
     """
     nearest, few, many = np.maximum(areas.T, 1e-300)
-    if noise_std >= _TELLING_NOISE * np.sqrt(np.pi / _MANY_NEIGHBOURS * np.median(many)):
+    if not thin_walls and noise_std >= _TELLING_NOISE * np.sqrt(np.pi / _MANY_NEIGHBOURS * np.median(many)):
         return False
     low, high = np.quantile(np.log(few / many), (0.16, 0.84))
-    return bool(high - low > 2 * _IRREGULAR_STD or _MANY_NEIGHBOURS * np.median(nearest / many) < _LINES_AREA_RATIO)
+    limit = _IRREGULAR_STD_OF_WALLS if thin_walls else _IRREGULAR_STD
+    return bool(high - low > 2 * limit or _MANY_NEIGHBOURS * np.median(nearest / many) < _LINES_AREA_RATIO)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fpsample
 import numpy as np
 import pytest
 
@@ -21,6 +22,13 @@ def plate(count: int, gap: float, seed: int = 0) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), gap * sides])
 
 
+def even_plate(count: int, gap: float) -> np.ndarray:
+    """Return points (count, 3) that keep their distance on each of two such squares."""
+    walls = [plate(5 * count, 0.0, seed)[:, :2] for seed in (0, 1)]
+    kept = [wall[fpsample.bucket_fps_kdline_sampling(wall, count // 2, h=7, start_idx=0)] for wall in walls]
+    return np.column_stack([np.concatenate(kept), np.repeat([-gap / 2, gap / 2], count // 2)])
+
+
 def thin_walls(xyz: np.ndarray) -> bool:
     return Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.0).thin_walls
 
@@ -37,10 +45,12 @@ def test_two_walls_are_told_from_one_with_noise(noise_std: float) -> None:
         assert not thin_walls(cloud + 0.04 * ball)
 
 
-def test_points_on_walls_are_not_evened_out_though_the_walls_are_read_as_noise() -> None:
-    for xyz, irregular in ((noisy(plate(2000, 0.04), 0.008), True), (noisy(sphere(2000), 0.008), False)):
-        read = Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.06)  # more than their spacing: nothing tells
-        assert (read.thin_walls, read.irregular) == (irregular, irregular)
+@pytest.mark.parametrize("by_chance", [True, False])
+def test_how_points_lie_on_walls_is_told_though_the_walls_are_read_as_noise(by_chance: bool) -> None:
+    xyz = noisy(plate(3000, 0.05) if by_chance else even_plate(3000, 0.05), 0.008)
+    read = Sampling.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), 0.06)  # noise of more than their spacing
+    assert read.thin_walls
+    assert read.irregular == by_chance
 
 
 def test_a_step_that_brings_walls_together_is_told_from_one_within_them() -> None:
