@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from straightpcf.points.formats import format_named, read_cloud
-from tests.points.test_xyz import MALFORMED, TABBED, TABLES
+from tests.points.test_xyz import TABBED, TABLES
+from tests.points.test_xyz_refused import MALFORMED
 
 POSITIONS = "async ([b, name]) => [...(await import('/static/read/index.js')).readPositions(new Uint8Array(b), name)]"
 

@@ -6,6 +6,8 @@ export const MARKS = [";", ","]; // what may stand between cells where it is not
 const POSITIONS = [
   ["x", "y", "z"],
   ["points:0", "points:1", "points:2"],
+  ["points_m_xyz:0", "points_m_xyz:1", "points_m_xyz:2"],
+  ["point_x", "point_y", "point_z"],
   ["px", "py", "pz"],
   ["pos_x", "pos_y", "pos_z"],
   ...["elevation", "height", "altitude", "z"].map((height) => ["easting", "northing", height]),
@@ -15,6 +17,7 @@ const POSITIONS = [
   ["x1", "y1", "z1"],
   ["0", "1", "2"],
 ];
+const DEGREES = [["lat", "latitude"], ["lon", "lng", "long", "longitude"]];
 const UNIT = /\s*(\[.*\]|\(.*\))$/;
 const BEFORE_UNIT = /(?<!\s)\s+(?=[[(])/g;
 const LEAD = /^[^,;\t:]*:\s+/; // columns: x y z
@@ -24,6 +27,7 @@ const MISSING = ["", "na", "null"]; // a cell of a delimited table without a num
 const REMARKS = 20; // the last comments above a table, of which one may be its title
 const COUNTED = 10; // points: of fewer, an x may go up by one each
 const TAB = 9;
+const UNKNOWN_NAMES = "names that do not say x, y, z";
 
 export function readXyz(bytes, marks = MARKS) {
   const rows = new Rows();
@@ -108,10 +112,17 @@ function layout(line, names, remarks, marks) {
     const fitting = meant(title, marks).map((labels) => fitted(labels, cells)).filter((labels) => labels !== null);
     const axes = fitting.map(axesOf).find((found) => found !== null);
     if (axes) return { delimiter, axes, isNamed: true };
+    if (fitting.some(areDegrees)) throw new Error(UNKNOWN_NAMES);
     const isRefused = fitting.length > 0 || meant(title, marks).some((labels) => axesOf(labels) !== null);
-    if (title && title === names && cells.length > 3 && isRefused) throw new Error("names that do not say x, y, z");
+    if (title && title === names && cells.length > 3 && isRefused) throw new Error(UNKNOWN_NAMES);
   }
   return { delimiter, axes: [0, 1, 2], isNamed: false };
+}
+
+// No distance can be told in latitude and longitude.
+function areDegrees(labels) {
+  const plain = labels.map((label) => label.replace(UNIT, "").toLowerCase());
+  return DEGREES.every((names) => names.some((name) => plain.includes(name)));
 }
 
 // The names in a title as they may be meant: `x [m]` as one, `Point Id` between tabs, `columns: x y z`.
