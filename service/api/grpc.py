@@ -51,6 +51,8 @@ MAX_EVENT_ID = 999_999_999  # as in REST
 _OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
+    # gRPC cancels a call that a busy event loop has not taken after 30 s; how long it waits is its caller's to say.
+    ("grpc.server_max_unrequested_time_in_server", 3600),
     ("grpc.so_reuseport", 0),  # two servers on one port would share its calls
 )
 
