@@ -21,7 +21,7 @@ from straightpcf.points.wire.jobs import JOB_ID, JOB_ID_RULE
 from straightpcf.service.admission import Limits
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.jobs.folders import JobFolders, digest_of
-from straightpcf.service.jobs.full_disk import keep_reserve
+from straightpcf.service.jobs.full_disk import DISK_TROUBLES, keep_reserve
 from straightpcf.service.jobs.record import JobEvent, JobRecord, JobState, NewJob
 from straightpcf.service.jobs.runner import JobRunner
 from straightpcf.service.jobs.store import JobStore
@@ -74,6 +74,7 @@ class Engine:
         self.limits = limits
         self._ends_at: float | None = None  # time.monotonic(), once it drains
         self._data_dir = data_dir
+        self._lent: dict[str, str] = {}  # owners by id
         self._call = StoreThread(data_dir)
         self._news: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
         self._folders: JobFolders
@@ -135,6 +136,8 @@ class Engine:
         self.drain()
         await self._sweeper.stop()
         await self._runner.stop(lambda: self.patience_seconds)
+        for id, owner in list(self._lent.items()):  # their calls were cut off
+            await self.forget(id, owner=owner)
         await self.backend.stop()
         await self._call.close()
         self._folders.close()
@@ -327,6 +330,21 @@ class Engine:
         await asyncio.to_thread(self._folders.remove, record.folder)
         await asyncio.to_thread(keep_reserve, self._data_dir)
         self._notify(id)
+
+    def lend(self, id: str, *, owner: str = "") -> None:
+        """Let a job, which need not be there yet, live no longer than this server, unless `forget` is called before."""
+        self._lent[id] = owner
+
+    async def forget(self, id: str, *, owner: str = "") -> None:
+        """Delete a job that nobody knows but its call, if it is there."""
+        try:
+            await self.delete(id, owner=owner)
+        except NotFound:  # it was not committed, or someone found it in the list, and was quicker
+            pass
+        except DISK_TROUBLES as fault:
+            logger.warning("job %s: its call is over, but it is kept until it expires: %r", id, fault)
+        finally:
+            self._lent.pop(id, None)
 
     # --- inside
 

@@ -15,7 +15,7 @@ from google.protobuf.empty_pb2 import Empty
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from straightpcf.points.errors import InvalidOptions, InvalidRequest, NotFound, RangeNotSatisfiable
+from straightpcf.points.errors import InvalidOptions, InvalidRequest, RangeNotSatisfiable
 from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire import straightpcf_pb2 as pb
@@ -46,10 +46,13 @@ SERVICE = pb.DESCRIPTOR.services_by_name["DenoiseService"].full_name
 CHUNK_BYTES = 2**18
 WRITE_BYTES = 2**20
 HEALTH_SECONDS = 0.25
+FORGETTING_SECONDS = 1.0
 MAX_EVENT_ID = 999_999_999  # as in REST
 _OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
+    # gRPC cancels a call that a busy event loop has not taken after 30 s; how long it waits is its caller's to say.
+    ("grpc.server_max_unrequested_time_in_server", 3600),
     ("grpc.so_reuseport", 0),  # two servers on one port would share its calls
 )
 
@@ -95,6 +98,9 @@ class GrpcServer:
                 await self._service.wait_idle()
         # Its own grace period waits for calls whose connection broke in the middle of a message, too.
         await self._server.stop(0)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FORGETTING_SECONDS):  # of cancelled calls, which remove their jobs
+                await self._service.wait_idle()
 
     async def _keep_health(self) -> None:
         states = health_pb2.HealthCheckResponse
@@ -140,6 +146,8 @@ class DenoiseService(stubs.DenoiseServiceServicer):
             # may be cancelled while its job is being committed.
             named = config.job.id or caller.idempotency_key is not None
             private = None if named else uuid.uuid4().hex
+            if private is not None:
+                self._engine.lend(private, owner=caller.owner)
             try:
                 id = private or config.job.id or None
                 record, _ = await self._take(config.job, requests, caller, endpoint="denoise", id=id)
@@ -158,7 +166,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 await context.write(pb.DenoiseResponse(summary=_job(record)))
             finally:
                 if private is not None:
-                    await asyncio.shield(self._forget(private, owner=caller.owner))
+                    await asyncio.shield(self._engine.forget(private, owner=caller.owner))
 
     async def CreateJob(  # noqa: N802
         self, requests: AsyncIterator[pb.CreateJobRequest], context: Context
@@ -261,10 +269,6 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 traceparent=caller.traceparent,
             )
             return await engine.submit(source, wanted)
-
-    async def _forget(self, id: str, *, owner: str) -> None:
-        with contextlib.suppress(NotFound):  # it was not committed, or someone else deleted it
-            await self._engine.delete(id, owner=owner)
 
     async def _progress(self, record: JobRecord) -> AsyncIterator[pb.Progress]:
         async for event in self._engine.events(record.id, owner=record.owner):

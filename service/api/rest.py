@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
@@ -11,7 +10,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect
 
-from straightpcf.points.errors import NotFound, ServerBusy
+from straightpcf.points.errors import ServerBusy
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import open_result, report_and_file, result_response
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
@@ -81,14 +80,17 @@ async def denoise(request: Request, owner: Owner) -> Response:
         record = await _wait_while_connected(engine, request, record, seconds)
     except ClientDisconnect:
         if private:
-            await _forget(engine, record)
+            await engine.forget(record.id, owner=owner)
         raise
     except ServerBusy:  # it shuts down: the job is done at its next start
         record = await engine.get(record.id, owner=owner)
     applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
         return job_response(record, 202, applied)
-    cleanup = BackgroundTask(_forget, engine, record) if private else None
+    cleanup = None
+    if private:
+        engine.lend(record.id, owner=owner)
+        cleanup = BackgroundTask(engine.forget, record.id, owner=owner)
     try:
         file, record = await open_result(engine, record.id, owner=owner)
         if flag(fields, "report"):
@@ -99,7 +101,7 @@ async def denoise(request: Request, owner: Owner) -> Response:
         return answer
     except Exception:
         if private:
-            await _forget(engine, record)
+            await engine.forget(record.id, owner=owner)
         raise
 
 
@@ -147,11 +149,6 @@ async def _wait_while_connected(engine: Engine, request: Request, record: JobRec
     finally:
         gone.cancel()
         result.cancel()
-
-
-async def _forget(engine: Engine, record: JobRecord) -> None:
-    with contextlib.suppress(NotFound):  # someone found it in the list, and was quicker
-        await engine.delete(record.id, owner=record.owner)
 
 
 async def _disconnected(request: Request) -> None:

@@ -217,6 +217,18 @@ def test_ones_jobs_are_listed_however_many_came_after_them(page: Any, scan: Path
     assert page.locator("#jobs-list li").count() == 1
 
 
+def test_two_jobs_of_one_file_are_told_apart_by_name(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    for made in (1, 2):
+        page.click("#submit")
+        page.locator("#jobs-list a").nth(made - 1).wait_for()
+    names = page.locator("#jobs-list li .name").all_inner_texts()
+    assert names == [f"{scan.name} (2)", scan.name]
+    labels = [each.get_attribute("aria-label") for each in page.locator("#jobs-list [aria-label]").all()]
+    assert len(set(labels)) == len(labels) == 6
+
+
 def test_an_upload_is_not_lost_to_a_look_at_another_job(page: Any, scan: Path, tmp_path: Path) -> None:
     np.save(large := tmp_path / "large.npy", noisy(sphere(40_000), 0.01))
     page.set_input_files("#file", scan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import httpx2
 import pytest
 
 grpc = pytest.importorskip("grpc")
+
+from google.protobuf.empty_pb2 import Empty  # noqa: E402
 
 from straightpcf.points.errors import MalformedFile  # noqa: E402
 from straightpcf.points.wire import straightpcf_pb2 as pb  # noqa: E402
@@ -182,3 +185,19 @@ def test_an_error_of_any_length_arrives_as_what_it_is(tmp_path: Path, letter: st
             assert record.error.message == text[:1000]
 
     play(scenario)
+
+
+@pytest.mark.slow
+def test_calls_that_a_busy_server_has_not_taken_within_half_a_minute_wait_on(tmp_path: Path) -> None:
+    def ask(port: int) -> list[str]:
+        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+            calls = [DenoiseServiceStub(channel).GetServerInfo.future(Empty()) for _ in range(20)]
+            return [call.code().name for call in calls]
+
+    async def scenario() -> None:
+        async with serving(tmp_path, ObedientBackend(), grpc_port=(port := free_port())):
+            codes = asyncio.get_running_loop().run_in_executor(None, ask, port)  # begins at once
+            time.sleep(36)  # the event loop is held up; gRPC's own threads go on
+            assert set(await codes) == {"OK"}
+
+    asyncio.run(scenario())

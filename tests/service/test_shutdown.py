@@ -12,6 +12,7 @@ import subprocess
 import time
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from tests.clouds import noisy, torus
 from tests.conftest import run_server
 from tests.service.engines import running, submit
 from tests.service.fakes import Large
+from tests.service.in_process import free_port, serving
 from tests.waiting import wait_for
 
 
@@ -134,6 +136,42 @@ def test_a_download_that_does_not_end_is_cut_off_in_time_and_quietly(tmp_path: P
             server.process.send_signal(signal.SIGTERM)
             assert server.process.wait(timeout=20) == 0
         assert "Traceback" not in server.log.read_text()
+
+
+@pytest.mark.parametrize("over", ["rest", "grpc"])
+def test_a_private_job_whose_download_is_cut_off_leaves_nothing(tmp_path: Path, over: str) -> None:
+    grpc = pytest.importorskip("grpc")
+    from straightpcf.points.wire import straightpcf_pb2 as pb
+    from straightpcf.points.wire.straightpcf_pb2_grpc import DenoiseServiceStub
+
+    async def begin(host: str, port: int, grpc_port: int) -> Any:
+        """Ask for a result, and read only its beginning; return what closes the connection."""
+        if over == "rest":
+            reader, writer = await asyncio.open_connection(host, port)
+            head = b"POST /denoise?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\nContent-Length: 6\r\n\r\n"
+            writer.write(head + b"0 0 0\n")
+            assert await reader.readexactly(12) == b"HTTP/1.1 200"
+            return writer.close
+        config = pb.DenoiseConfig(job=pb.JobConfig(filename="a.xyz"), return_file=True)
+        parts = [pb.DenoiseRequest(config=config), pb.DenoiseRequest(chunk=b"0 0 0\n")]
+        call = DenoiseServiceStub(channel := grpc.aio.insecure_channel(f"{host}:{grpc_port}")).Denoise(iter(parts))
+        while (await call.read()).WhichOneof("part") != "chunk":
+            pass
+        loop = asyncio.get_running_loop()
+        return lambda: loop.create_task(channel.close())
+
+    async def scenario() -> None:
+        backend = Large()
+        backend.go.set()
+        backend.finish.set()
+        async with serving(tmp_path, backend, grpc_port=(grpc_port := free_port())) as (engine, host, port):
+            close = await begin(host, port, grpc_port)
+            assert len((await engine.list())[0]) == 1
+        assert not list(tmp_path.glob("jobs/*"))
+        if (closing := close()) is not None:
+            await closing
+
+    asyncio.run(asyncio.wait_for(scenario(), timeout=60))
 
 
 def test_kill_9_of_the_server_ends_the_worker_and_the_next_server_does_the_job(tmp_path: Path) -> None:

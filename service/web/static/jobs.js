@@ -44,7 +44,7 @@ export async function showJobs({ section, list, ...hooks }) {
   const ours = await found();
   section.hidden = ours.length === 0;
   const again = () => showJobs({ section, list, ...hooks });
-  const rows = ours.map((job) => row(job, { again, ...hooks }));
+  const rows = ours.map((job, at) => row(job, { name: told(ours, at), again, ...hooks }));
   const focused = list.contains(document.activeElement) ? document.activeElement : null;
   const place = [...list.children].findIndex((item) => item.contains(focused));
   list.replaceChildren(...rows);
@@ -71,9 +71,19 @@ function focusAgain(list, label, place) {
   (same ?? row?.querySelector("button") ?? document.getElementById("file")).focus();
 }
 
-function row(job, { again, onShow, onDeleted, onProblem }) {
+// What a job is called beside others: of those with one name, the oldest first, the second is "name (2)".
+function told(jobs, at) {
+  const name = nameOf(jobs[at]);
+  const number = jobs.slice(at).filter((job) => nameOf(job) === name).length;
+  return number === 1 ? name : `${name} (${number})`;
+}
+
+function nameOf(job) {
+  return job.name ?? job.id;
+}
+
+function row(job, { name, again, onShow, onDeleted, onProblem }) {
   const item = document.createElement("li");
-  const name = job.name ?? job.id;
   const size = job.points === null ? text.bytes(job.bytes) : text.plural(job.points, "point");
   const actions = element("div", "", { class: "actions" });
   const add = (label, attributes, act) => {
@@ -83,7 +93,7 @@ function row(job, { again, onShow, onDeleted, onProblem }) {
   };
   if (job.state !== "expired") add("Show", {}, () => onShow(job));
   if (job.state === "succeeded") {
-    const link = element("a", "Download", { class: "plain button", "aria-label": `Download ${job.result.filename}` });
+    const link = element("a", "Download", { class: "plain button", "aria-label": `Download the result of ${name}` });
     offerDownload(link, job, onProblem);
     actions.append(link);
   }
