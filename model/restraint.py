@@ -54,7 +54,9 @@ def restrained_step(
         return step, False
     if trusted_noise is not None:
         step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch)
-    share = share_between_walls(step, patch, uncovered=sampling.uncovered) if sampling.thin_walls else 1.0
+    share = 1.0
+    if sampling.thin_walls:
+        share = share_between_walls(step, patch, uncovered=sampling.uncovered, by_chance=sampling.irregular)
     if share < 1:
         step = share * step
     if sampling.irregular:

@@ -34,6 +34,9 @@ _THICK_RATIO = 0.1  # of the neighbourhood's radius, the std of the heights: wha
 # Moves across, in stds of the points about the wall that each is on: up to the first all is made of them, from the
 # second on nothing. What the network tells apart it moves by 0.4 to 1.0 of that, what it joins or blurs by 1.2 to 1.8.
 _FULL_STEP_STDS, _NO_STEP_STDS = 1.1, 1.3
+# Of points that lie by chance the nearest 24 tell, in a patch where fewer than that share are midway: what the network
+# tells apart it moves by 0.25 to 0.65, what it joins by 0.7 to 1.5.
+_MIDWAY_SHARE_BY_CHANCE, _FULL_STEP_STDS_BY_CHANCE, _NO_STEP_STDS_BY_CHANCE = 0.3, 0.65, 0.75
 _SAMPLES = 128  # points of a patch that are looked at
 
 
@@ -66,14 +69,17 @@ class _Heights:
     def are_walls(self, few: float) -> bool:
         return self.midway < few and bool(self.thick.mean() > 0.5)
 
-    def share_left(self, step: Floats, few: float) -> float:
-        """Say how much is made of (n, 3), the first of the points' step, if it brings walls together."""
+    def share_left(self, step: Floats, few: float, full: float = _FULL_STEP_STDS, none: float = _NO_STEP_STDS) -> float:
+        """Say how much is made of (n, 3), the first of the points' step, if it brings walls together.
+
+        full, none: moves across, in stds of the noise, up to which all is made of it, and from which on nothing.
+        """
         thick = self.thick[: len(step)]
         if not self.are_walls(few) or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
         beside_noise = np.sqrt(np.square(rise).mean()) / max(self.noise, 1e-300)
-        return float(np.clip((_NO_STEP_STDS - beside_noise) / (_NO_STEP_STDS - _FULL_STEP_STDS), 0.0, 1.0))
+        return float(np.clip((none - beside_noise) / (none - full), 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -126,14 +132,20 @@ def has_walls(found: Sequence[Sequence[bool]]) -> bool:
     return bool(np.mean(found, axis=0).max() > _WALL_PATCHES_SHARE)
 
 
-def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False) -> float:
+def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False, by_chance: bool = False) -> float:
     """Return the share of a step (n, 3) that leaves walls apart: 0 where it joins them, 1 where there are none.
 
-    patch: (P, 3) points, of which the first n >= 1 make the step; uncovered: as of `between_walls`.
+    patch: (P, 3) points, of which the first n >= 1 make the step; uncovered: as of `between_walls`; by_chance: whether
+    that is how the points lie on the walls, not evenly.
     """
     few = _UNCOVERED_MIDWAY_SHARE if uncovered else _WALLS_MIDWAY_SHARE
     looked_at = np.arange(0, max(len(step), round(INNER_SHARE * len(patch))))
     looked_at = looked_at[:: max(1, len(looked_at) // _SAMPLES)]
     some, their_step = patch[looked_at], step[looked_at[looked_at < len(step)]]
     near = Nearest.of(some, patch, max(_NEIGHBOUR_COUNTS))
-    return min(_Heights.of(near.first(count)).share_left(their_step, few) for count in _NEIGHBOUR_COUNTS)
+    heights = [_Heights.of(near.first(count)) for count in _NEIGHBOUR_COUNTS]
+    shares = [h.share_left(their_step, few) for h in heights]
+    if by_chance:
+        limits = _MIDWAY_SHARE_BY_CHANCE, _FULL_STEP_STDS_BY_CHANCE, _NO_STEP_STDS_BY_CHANCE
+        shares.append(heights[0].share_left(their_step, *limits))
+    return min(shares)

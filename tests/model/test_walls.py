@@ -72,6 +72,14 @@ def test_a_thin_plate_of_few_points_comes_back_as_it_came_and_a_warning_says_so(
     assert any("walls closer together" in warning for warning in result.warnings)
 
 
+def test_walls_of_plates_on_which_few_points_lie_by_chance_are_not_joined() -> None:
+    walls = np.arange(-3, 4, 2)[:, None] * 0.1 + [-0.03, 0.03]  # four plates
+    clean = plate(3000, 0.0) + np.random.default_rng(1).choice(walls.ravel(), 3000)[:, None] * [0, 0, 1]
+    rough = noisy(clean, 0.005)
+    result = load_filter(threads=2).denoise(rough)
+    assert chamfer_distance(result.xyz, clean) <= 1.1 * chamfer_distance(rough, clean)
+
+
 def test_walls_that_the_first_pass_uncovers_are_not_joined_by_the_next() -> None:
     rough = noisy(plate(2000, 0.04, 1), 0.014)
     assert not thin_walls(rough)
