@@ -13,7 +13,7 @@ from straightpcf.points.errors import MalformedFile
 
 __all__ = ["Calibration"]
 
-_ONE_PASS_DISTANCE = 0.8  # d of noise that one pass takes most of
+_ONE_PASS_DISTANCE = 0.87  # d of noise that one pass takes most of
 # As `stuck`, where walls close together were seen at the start: of points that lie by chance a second pass would join
 # them, of even points, of whose d the first leaves less, it does good.
 _STUCK_BETWEEN_WALLS = 0.61
