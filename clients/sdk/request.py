@@ -150,6 +150,8 @@ def upload_call(
         params["format"] = format_named(format).name
     if key is not None and not (key.isascii() and key.isprintable()):
         raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
+    if key is not None and key != key.strip():
+        raise InvalidRequest(f"the idempotency key begins or ends with a space: {key[:40]!r}")
     size = body.stat().st_size if isinstance(body, Path) else len(body)
     headers = {
         "Content-Type": "application/octet-stream",

@@ -53,3 +53,9 @@ def test_a_call_names_the_argument_that_is_of_another_kind() -> None:
         for argument, call in calls:
             with pytest.raises(InvalidRequest, match=f"^{argument} is "):
                 call()
+
+
+@pytest.mark.parametrize("key", [" key", "key ", " "])
+def test_an_idempotency_key_that_no_header_carries_as_it_is_is_refused(key: str) -> None:
+    with Client(NOBODY) as client, pytest.raises(InvalidRequest, match="begins or ends with a space"):
+        client.jobs.create(np.zeros((40, 3)), idempotency_key=key)
