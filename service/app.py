@@ -34,6 +34,7 @@ from straightpcf.service.api.rest import router
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
+from straightpcf.service.connection import connection_class
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
@@ -117,6 +118,7 @@ def serve(settings: Settings) -> None:
         port=settings.port,
         timeout_graceful_shutdown=settings.shutdown_seconds,
         lifespan="on",
+        http=connection_class(idle_seconds=settings.upload_idle_seconds),
         ws="none",
     )
     server = _Server(config, app.state.engine)
