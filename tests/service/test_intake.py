@@ -85,6 +85,16 @@ def test_text_without_a_name_is_told_to_bring_one(server: RunningServer) -> None
     assert "it needs a name with a suffix" in answer.json()["detail"]
 
 
+def test_a_form_whose_boundary_is_not_said_is_told_so(server: RunningServer) -> None:
+    for kind in ("multipart/form-data", "multipart/form-data; boundary="):
+        form = (
+            b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.npy"\r\n\r\n' + npy() + b"\r\n--b--\r\n"
+        )
+        answer = httpx2.post(f"{server.url}/jobs", content=form, headers={"Content-Type": kind})
+        assert (answer.status_code, answer.json()["code"]) == (400, "invalid_request")
+        assert "names no boundary" in answer.json()["detail"]
+
+
 @pytest.mark.parametrize(("id", "code"), [(".hidden", "invalid_request"), ("second", "quota_exceeded")])
 def test_what_refuses_a_job_whatever_its_body_is_said_before_it_comes(tmp_path: Path, id: str, code: str) -> None:
     async def scenario() -> None:
