@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import sys
@@ -112,6 +113,9 @@ def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
+    for name in ("stdout", "stderr"):  # which whoever starts it may have closed: uvicorn's log wants both
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     config = uvicorn.Config(
         _quiet_when_cut_off(app),
         host=settings.host,
