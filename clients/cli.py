@@ -18,17 +18,16 @@ from straightpcf.clients import job_commands
 from straightpcf.clients.atomic import check_target, replaced_when_complete
 from straightpcf.clients.console import (
     INTERRUPTED,
-    READER_GONE,
     asked_to_stop,
     complain,
-    exit_code,
-    forget_stdout,
+    ended_in_a_line,
     interruptible,
     needs,
     print_json,
     print_table,
     progress_bar,
     quiet_end,
+    say,
     show_noise,
 )
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
@@ -57,20 +56,15 @@ class Stage(StrEnum):
 class _Commands(TyperGroup):
     """End every command's error in one line and its exit code."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read what stands before the command: --help and --version print."""
+        with ended_in_a_line(ctx.params):
+            return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
-        try:
+        with ended_in_a_line(ctx.params):
             return super().invoke(ctx)
-        except (typer.Exit, typer.Abort):
-            raise
-        except BrokenPipeError as error:
-            forget_stdout()
-            raise typer.Exit(READER_GONE) from error
-        except Exception as error:
-            if hasattr(error, "show") or ctx.params.get("traceback"):  # a usage error shows itself
-                raise
-            complain(error)
-            raise typer.Exit(exit_code(error)) from error
 
 
 _TRAINING_DATA = "Clean clouds: an NPZ of (N, 3) floats, N >= 1000, called <shape>/<resolution>; may be given again."
@@ -272,7 +266,7 @@ def info(
 @app.command()
 def version() -> None:
     """Print the version."""
-    typer.echo(straightpcf.__version__)
+    say(straightpcf.__version__)
 
 
 @app.command()

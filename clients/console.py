@@ -11,13 +11,14 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
 import typer
 
+from straightpcf.clients.atomic import place_named
 from straightpcf.points import errors
 
 __all__ = [
@@ -26,20 +27,22 @@ __all__ = [
     "READER_GONE",
     "asked_to_stop",
     "complain",
+    "ended_in_a_line",
     "exit_code",
     "for_each",
-    "forget_stdout",
     "interruptible",
     "needs",
     "print_json",
     "print_table",
     "progress_bar",
     "quiet_end",
+    "say",
     "show_noise",
 ]
 
 INTERRUPTED = 130
 TIDY_SECONDS = 1.0
+_STDOUT = "stdout"
 READER_GONE = 141  # as of a process that SIGPIPE ends
 _T = TypeVar("_T")
 _OF_ALL = (errors.InvalidOptions, errors.Unauthorized, errors.ServerBusy, errors.ConnectionFailed)
@@ -77,7 +80,7 @@ def for_each(items: Sequence[_T], act: Callable[[_T], object]) -> None:
         try:
             act(item)
         except (errors.StraightPCFError, OSError) as error:
-            if len(items) == 1 or isinstance(error, BrokenPipeError):
+            if len(items) == 1 or _is_of_stdout(error):
                 raise
             complain(error, of=item)
             code = code or exit_code(error)
@@ -86,6 +89,11 @@ def for_each(items: Sequence[_T], act: Callable[[_T], object]) -> None:
                 break
     if code:
         raise typer.Exit(code)
+
+
+def _is_of_stdout(error: Exception) -> bool:
+    """Tell whether what is done could not be told: nothing more is to be done then."""
+    return isinstance(error, BrokenPipeError) or getattr(error, "filename", None) == _STDOUT
 
 
 def complain(error: Exception, *, of: object = None) -> None:
@@ -100,7 +108,24 @@ def complain(error: Exception, *, of: object = None) -> None:
     typer.echo(f"{where}error [{code}]: {' '.join(text.split())}", err=True)
 
 
-def forget_stdout() -> None:
+@contextmanager
+def ended_in_a_line(options: Mapping[str, Any]) -> Iterator[None]:
+    """End an error in one line and its exit code; options: with `traceback` it is raised as it is."""
+    try:
+        yield
+    except (typer.Exit, typer.Abort):
+        raise
+    except BrokenPipeError as error:
+        _forget_stdout()
+        raise typer.Exit(READER_GONE) from error
+    except Exception as error:
+        if hasattr(error, "show") or options.get("traceback"):  # a usage error shows itself
+            raise
+        complain(error)
+        raise typer.Exit(exit_code(error)) from error
+
+
+def _forget_stdout() -> None:
     """Write nothing more to a stdout that nobody reads, so that what is left in its buffer is no error at the end."""
     import os
 
@@ -219,10 +244,16 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         yield show
 
 
+def say(text: str) -> None:
+    """Print a line on stdout."""
+    with place_named(_STDOUT):
+        typer.echo(text)
+
+
 def print_json(value: Any) -> None:
     """Print a value, or a dataclass, on stdout."""
     facts = dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
-    typer.echo(json.dumps(facts, indent=2, default=str))
+    say(json.dumps(facts, indent=2, default=str))
 
 
 def print_table(facts: dict[str, Any]) -> None:
@@ -230,7 +261,7 @@ def print_table(facts: dict[str, Any]) -> None:
     for name, value in facts.items():
         if isinstance(value, dict):
             value = ", ".join(f"{key} ({text})" for key, text in value.items()) or "none"
-        typer.echo(f"{name.replace('_', ' '):<14}{value}")
+        say(f"{name.replace('_', ' '):<14}{value}")
 
 
 def show_noise(target: object, report: Any) -> None:

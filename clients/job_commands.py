@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from straightpcf.clients.atomic import check_target
-from straightpcf.clients.console import for_each, interruptible, print_json, print_table, progress_bar, show_noise
+from straightpcf.clients.atomic import check_target, place_named
+from straightpcf.clients.console import for_each, interruptible, print_json, print_table, progress_bar, say, show_noise
 from straightpcf.clients.stdio import STDIO, content_of, input_name, is_stream, stdout
 from straightpcf.points.errors import InvalidOptions
 
@@ -74,7 +74,7 @@ def submit(
                 content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
                 format=format, name=name or input_name(source), id=id,
             )  # fmt: skip
-            print_json(job.info.json) if as_json else typer.echo(job.id)
+            print_json(job.info.json) if as_json else say(job.id)
 
         for_each(sources, hand_over)
 
@@ -107,7 +107,7 @@ def cancel(
 ) -> None:
     """End jobs that wait or run."""
     with connect(url, api_key) as client:
-        for_each(ids, lambda id: typer.echo(f"{id} {client.jobs.get(id).cancel().state}"))
+        for_each(ids, lambda id: say(f"{id} {client.jobs.get(id).cancel().state}"))
 
 
 def jobs(
@@ -131,9 +131,7 @@ def jobs(
     for info in infos:
         points = "" if info.points is None else f"{info.points:,} points"
         when = info.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
-        typer.echo(
-            f"{info.id:<32}  {info.state:<12}{info.progress:>5.0%}  {when}  {info.name or '-'}  {points}".rstrip()
-        )
+        say(f"{info.id:<32}  {info.state:<12}{info.progress:>5.0%}  {when}  {info.name or '-'}  {points}".rstrip())
 
 
 def result(
@@ -153,7 +151,9 @@ def result(
             job.wait(on_progress=show)
         found = job.result(target if out is None else None)
         if out is not None:
-            out.write(found.read())
+            with place_named("stdout"):
+                out.write(found.read())
+                out.flush()  # before it is said to be done
     if as_json and out is None:
         print_json(found.job.json["report"])
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import sys
@@ -34,6 +35,7 @@ from straightpcf.service.api.rest import router
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
+from straightpcf.service.connection import connection_class
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
@@ -111,12 +113,16 @@ def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
+    for name in ("stdout", "stderr"):  # which whoever starts it may have closed: uvicorn's log wants both
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     config = uvicorn.Config(
         _quiet_when_cut_off(app),
         host=settings.host,
         port=settings.port,
         timeout_graceful_shutdown=settings.shutdown_seconds,
         lifespan="on",
+        http=connection_class(idle_seconds=settings.upload_idle_seconds),
         ws="none",
     )
     server = _Server(config, app.state.engine)

@@ -154,12 +154,14 @@ class Engine:
         if self.draining:
             raise ServerBusy("the server is shutting down")
         self.limits.check_bytes(size)
+        _check_id(id)
         if await self._call(JobStore.has, owner, id=id, idempotency_key=idempotency_key):
             return
         if self.backend.failure is not None:
             raise self.backend.failure
         load = await self._call(JobStore.load)
         self.limits.check_queue(load)
+        self.limits.check_key(await self._call(JobStore.load, owner))
         self.limits.check_disk(load, self._folders.free_bytes(), spool=self.limits.spool_bytes(size))
 
     def upload(self) -> AbstractContextManager[Path]:
@@ -184,8 +186,7 @@ class Engine:
         self.limits.check_bytes(size)
         if request.format is not None:
             format_named(request.format)  # raises before anything waits
-        if request.id is not None and not JOB_ID.fullmatch(request.id):
-            raise InvalidRequest(f"job id is {request.id[:80]!r}; it must be {JOB_ID_RULE}")
+        _check_id(request.id)
         content, weight = await asyncio.to_thread(
             lambda: (digest_of(source), estimate_points(source, name=request.name))
         )
@@ -371,6 +372,11 @@ class Engine:
     def _notify(self, id: str) -> None:
         if (news := self._news.pop(id, None)) is not None:
             news.set()
+
+
+def _check_id(id: str | None) -> None:
+    if id is not None and not JOB_ID.fullmatch(id):
+        raise InvalidRequest(f"job id is {id[:80]!r}; it must be {JOB_ID_RULE}")
 
 
 async def _first(news: asyncio.Event, seconds: float) -> None:

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from straightpcf.clients.sdk import flows
+from straightpcf.clients.sdk.arguments import path_of
 from straightpcf.clients.sdk.client import DEFAULT_TIMEOUT_SECONDS
 from straightpcf.clients.sdk.events import Event
 from straightpcf.clients.sdk.flows import OnProgress
@@ -68,10 +69,9 @@ class AsyncClient:
         on_progress: OnProgress | None = None,
     ) -> Denoised:
         """Do as `Client.denoise`; on_progress is an ordinary function."""
-        path = None if target is None else Path(target)
         flow = flows.denoise(
-            source, path, on_progress, timeout, silence=self._transport.timeout, iterations=iterations, seed=seed,
-            strength=strength, normals=normals, format=format, name=name,
+            source, path_of("target", target), on_progress, timeout, silence=self._transport.timeout,
+            iterations=iterations, seed=seed, strength=strength, normals=normals, format=format, name=name,
         )  # fmt: skip
         return await self._transport.run(flow)
 
@@ -169,7 +169,7 @@ class AsyncJob:
 
     async def result(self, target: str | Path | None = None) -> Denoised:
         """Do as `Job.result`."""
-        return await self._transport.run(flows.result(self.info, None if target is None else Path(target)))
+        return await self._transport.run(flows.result(self.info, path_of("target", target)))
 
     async def cancel(self) -> JobInfo:
         """Do as `Job.cancel`."""

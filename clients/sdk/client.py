@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from straightpcf.clients.sdk import flows
+from straightpcf.clients.sdk.arguments import path_of
 from straightpcf.clients.sdk.events import Event
 from straightpcf.clients.sdk.flows import OnProgress
 from straightpcf.clients.sdk.job_info import JobInfo, JobState
@@ -81,10 +82,9 @@ class Client:
         timeout: seconds after which JobNotFinished is raised. on_progress: called with the share that is done, 0..1.
         Raises the StraightPCFError that the server met. Whatever ends this early ends the work on the server too.
         """
-        path = None if target is None else Path(target)
         flow = flows.denoise(
-            source, path, on_progress, timeout, silence=self._transport.timeout, iterations=iterations, seed=seed,
-            strength=strength, normals=normals, format=format, name=name,
+            source, path_of("target", target), on_progress, timeout, silence=self._transport.timeout,
+            iterations=iterations, seed=seed, strength=strength, normals=normals, format=format, name=name,
         )  # fmt: skip
         return self._transport.run(flow)
 
@@ -184,7 +184,7 @@ class Job:
 
         Raises JobNotFinished, JobExpired, JobCanceled, or what the job failed with.
         """
-        return self._transport.run(flows.result(self.info, None if target is None else Path(target)))
+        return self._transport.run(flows.result(self.info, path_of("target", target)))
 
     def cancel(self) -> JobInfo:
         """End it."""

@@ -8,7 +8,7 @@ import math
 import os
 import time
 import uuid
-from collections.abc import AsyncGenerator, Collection, Generator, Mapping
+from collections.abc import AsyncGenerator, Collection, Generator, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.clients.atomic import check_target
+from straightpcf.clients.sdk.arguments import check_count, check_path, check_text
 from straightpcf.points.cloud import as_positions
 from straightpcf.points.errors import InvalidRequest, NotFound
 from straightpcf.points.formats import format_by_suffix, format_named, format_wanted, recognised
@@ -126,6 +127,9 @@ def upload_call(
 
     Raises InvalidOptions, InvalidRequest, InvalidCloud, UnknownFormat, OSError before anything is sent.
     """
+    for argument, text in {"format": format, "idempotency_key": key, "id": id}.items():
+        check_text(argument, "" if text is None else text)
+    check_path("name", name)
     options = DenoiseOptions.parse(
         iterations=str(iterations), seed=str(seed), strength=str(strength), normals=str(normals)
     )
@@ -146,6 +150,8 @@ def upload_call(
         params["format"] = format_named(format).name
     if key is not None and not (key.isascii() and key.isprintable()):
         raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
+    if key is not None and key != key.strip():
+        raise InvalidRequest(f"the idempotency key begins or ends with a space: {key[:40]!r}")
     size = body.stat().st_size if isinstance(body, Path) else len(body)
     headers = {
         "Content-Type": "application/octet-stream",
@@ -177,9 +183,12 @@ def job_call(id: str, *, wait: float = 0.0, until: float = math.inf) -> Call:
 
 def list_call(states: Collection[str], limit: int, cursor: str | None) -> Call:
     """Build the request for one page of jobs; raises InvalidRequest."""
+    if not isinstance(states, Iterable):
+        raise InvalidRequest(f"states is {states!r:.80}; it must be some of {', '.join(STATES)}")
     states = [states] if isinstance(states, str) else list(states)  # which may be an iterator
-    if unknown := set(states) - set(STATES):
-        raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
+    if unknown := [state for state in states if state not in STATES]:
+        raise InvalidRequest(f"state is {unknown[0]!r:.80}; it must be one of {', '.join(STATES)}")
+    check_count("page_size", limit)
     if not 1 <= limit <= MAX_PAGE_SIZE:
         raise InvalidRequest(f"page_size is {limit}; it must be in 1..{MAX_PAGE_SIZE}")
     params: dict[str, str | list[str]] = {"limit": str(limit)}

@@ -102,6 +102,8 @@ async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Up
 
 
 async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, limits: Limits) -> Upload:
+    if not boundary:  # of a client that was given the header and made another one itself
+        raise InvalidRequest("Content-Type is multipart/form-data and names no boundary: let your HTTP client set it")
     form = _Form(spool.buffer)
     received, chunks = 0, request.stream()
     try:

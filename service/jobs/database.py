@@ -23,24 +23,37 @@ _KEPT = "CREATE INDEX IF NOT EXISTS jobs_kept ON jobs (owner, spool) WHERE state
 
 
 class OpenedFile:
-    """Remember which file was opened: SQLite goes on writing to one that was deleted or replaced, and it is lost."""
+    """Remember which files were opened: SQLite goes on writing to those that were deleted or replaced, and it is lost.
+
+    Beside the database its -wal, where the last commits are, and its -shm, by which processes know of each other: they
+    are the same for as long as it is open, on a disk where SQLite has them.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._opened = path, path.stat()
+        self._path = path
+        parts = [path.with_name(f"{path.name}-{part}") for part in ("wal", "shm")]
+        self._opened = {path: path.stat()} | {part: part.stat() for part in parts if part.exists()}
 
     @property
     def in_place(self) -> bool:
-        """Tell whether it is still there."""
-        try:
-            return os.path.samestat(self._path.stat(), self._opened)
-        except OSError:
-            return False
+        """Tell whether they are still there."""
+        return self._lost() is None
 
     def check(self) -> None:
-        """Raise OSError if it is not."""
-        if not self.in_place:
-            told = "deleted or replaced under this server: put it back, or restart the server and its jobs are lost"
-            raise OSError(errno.ESTALE, told, str(self._path))
+        """Raise OSError if they are not."""
+        if (lost := self._lost()) is not None:
+            way = "put it back, or restart the server and its jobs are lost" if lost == self._path else "restart it"
+            raise OSError(errno.ESTALE, f"deleted or replaced under this server: {way}", str(lost))
+
+    def _lost(self) -> Path | None:
+        for path, opened in self._opened.items():
+            try:
+                is_same = os.path.samestat(path.stat(), opened)
+            except OSError:
+                return path
+            if not is_same:
+                return path
+        return None
 
 
 def check_database(path: Path) -> None:

@@ -115,6 +115,32 @@ def test_a_reader_that_goes_away_and_a_name_that_stdout_cannot_show_are_no_error
     assert "wölkchen \\u4e91.npy".encode("latin-1") in shown
 
 
+def test_a_full_stdout_is_named_and_ends_what_it_cannot_tell_of(server: RunningServer, scan: Path) -> None:
+    kept = cli(server, "submit", scan, "--iterations", 1).stdout.decode().strip()
+    assert cli(server, "wait", kept).returncode == 0
+    before = len(cli(server, "jobs").stdout.splitlines())
+    said = b"error [invalid_request]: [Errno 28] No space left on device: 'stdout'\n"
+    environment = clean_environment() | {"STRAIGHTPCF_URL": server.url}
+    for arguments in (["submit", scan, scan, scan], ["result", kept, "-"], ["jobs"], ["status", kept, "--json"]):
+        with Path("/dev/full").open("wb") as full:
+            command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, check=False)
+        assert (done.returncode, done.stderr) == (3, said), arguments
+    assert len(cli(server, "jobs").stdout.splitlines()) == before + 1  # of three that were to be submitted
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_what_cannot_be_printed_before_a_command_ends_as_in_one(option: str) -> None:
+    line = f"{{ {sys.executable} -m straightpcf.clients.cli {option}; echo $? >&2; }} | sleep 0"
+    done = subprocess.run(
+        ["/bin/sh", "-c", line], stderr=subprocess.PIPE, env=clean_environment(), check=False, timeout=60
+    )
+    assert done.stderr.strip() == b"141"
+    line = f"{sys.executable} -m straightpcf.clients.cli {option} >/dev/full"
+    done = subprocess.run(["/bin/sh", "-c", line], stderr=subprocess.PIPE, env=clean_environment(), check=False)
+    assert (done.returncode, done.stderr.count(b"\n")) == (3, 1), done.stderr
+
+
 def test_the_console_script_runs_the_same(server: RunningServer) -> None:
     command = [sys.executable, "-m", "straightpcf.clients", "version"]
     assert subprocess.run(command, capture_output=True, check=True).stdout == cli(None, "version").stdout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -69,3 +70,14 @@ def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:
     said = "async (b) => { try { await (%s)(b) } catch (error) { return error.message } }" % read  # noqa: UP031
     for case in (case for case, (_, pattern) in MALFORMED.items() if "name" in pattern):
         assert page.evaluate(said, list(MALFORMED[case][0])) == "names that do not say x, y, z", case
+
+
+def test_the_page_refuses_what_is_no_number_as_the_server_does(page: Any) -> None:
+    """Numbers with decimal commas among it: between commas they would be points elsewhere."""
+    said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031
+    for case, (raw, pattern) in MALFORMED.items():
+        if "no number" in pattern or "have a point" in pattern:
+            assert re.search("is no number|no comma", str(page.evaluate(said, [list(raw), "a.txt"]))), case
+    for row in ("1,2,3,4,5,6", "1, 2, 3, 4, 5, 6", "0,5, 1,5,2,5", "1,10,2,20,3,30"):
+        assert page.evaluate(said, [list(f"{row}\n".encode() * 2), "a.csv"]) == 6, row
+    assert page.evaluate(said, [list(b"1;;NULL\nna;nan;1.#IND\n"), "a.csv"]) == 6

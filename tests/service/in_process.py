@@ -12,6 +12,7 @@ from typing import Any
 import uvicorn
 
 from straightpcf.service.app import create_app
+from straightpcf.service.connection import connection_class
 from straightpcf.service.engine import Engine
 from straightpcf.service.settings import Settings
 from tests.service.fakes import ObedientBackend
@@ -20,8 +21,11 @@ from tests.service.fakes import ObedientBackend
 @asynccontextmanager
 async def serving(folder: Path, backend: ObedientBackend, **settings: Any) -> AsyncIterator[tuple[Engine, str, int]]:
     """Serve until the block ends; yield the engine, the host and the port."""
-    app = create_app(Settings(data_dir=folder, **{"shutdown_seconds": 1} | settings), backend=backend)
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, ws="none", timeout_graceful_shutdown=1))
+    chosen = Settings(data_dir=folder, **{"shutdown_seconds": 1} | settings)
+    app = create_app(chosen, backend=backend)
+    http = connection_class(idle_seconds=chosen.upload_idle_seconds)
+    config = uvicorn.Config(app, port=0, log_config=None, http=http, ws="none", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
     task = asyncio.create_task(server.serve())
     while not server.started:
         assert not task.done(), task.exception()

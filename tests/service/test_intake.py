@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
+from pathlib import Path
 
 import httpx2
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
+from tests.service.in_process import serving
+from tests.service.test_races import CLOUD, play, willing
 
 XYZ = noisy(torus(400), 0.01)
 
@@ -79,3 +83,34 @@ def test_text_without_a_name_is_told_to_bring_one(server: RunningServer) -> None
     answer = httpx2.post(f"{server.url}/denoise", content=b"0 0 0\n" * 50, timeout=60)
     assert answer.json()["code"] == "unknown_format"
     assert "it needs a name with a suffix" in answer.json()["detail"]
+
+
+def test_a_form_whose_boundary_is_not_said_is_told_so(server: RunningServer) -> None:
+    for kind in ("multipart/form-data", "multipart/form-data; boundary="):
+        form = (
+            b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.npy"\r\n\r\n' + npy() + b"\r\n--b--\r\n"
+        )
+        answer = httpx2.post(f"{server.url}/jobs", content=form, headers={"Content-Type": kind})
+        assert (answer.status_code, answer.json()["code"]) == (400, "invalid_request")
+        assert "names no boundary" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(("id", "code"), [(".hidden", "invalid_request"), ("second", "quota_exceeded")])
+def test_what_refuses_a_job_whatever_its_body_is_said_before_it_comes(tmp_path: Path, id: str, code: str) -> None:
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend, max_jobs_per_key=1) as (_, host, port):
+            async with httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http:
+                first = {"url": "/jobs/first?filename=a.xyz", "content": CLOUD}
+                assert (await http.put(**first)).status_code == 202
+                assert (await http.put(**first)).status_code == 200  # which is no other job
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(f"PUT /jobs/{id}?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\n".encode())
+            writer.write(b"Content-Length: 6\r\nExpect: 100-continue\r\n\r\n")
+            answer = await asyncio.wait_for(reader.readuntil(b"}"), timeout=5)
+            writer.close()
+            assert b"100 Continue" not in answer
+            assert f'"code":"{code}"'.encode() in answer
+
+    play(scenario)

@@ -14,7 +14,7 @@ import pytest
 from straightpcf.points.errors import SpoolFull
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.store import JobStore
-from tests.conftest import clean_environment
+from tests.conftest import clean_environment, run_server
 from tests.service.engines import play, submit
 from tests.service.fakes import ObedientBackend
 
@@ -55,3 +55,8 @@ def test_a_first_sweep_that_fails_is_made_up_for_by_the_next(tmp_path: Path, mon
 
     monkeypatch.setattr(JobStore, "expire", full)
     play(tmp_path, scenario)
+
+
+def test_a_server_whose_stdout_is_closed_starts(tmp_path: Path) -> None:
+    with run_server(tmp_path, within=("/bin/sh", "-c", 'exec "$@" >&-', "sh")) as server:
+        assert server._status("/livez") == 200

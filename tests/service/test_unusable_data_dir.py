@@ -119,6 +119,27 @@ def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that
     assert not [record for record in caplog.records if record.exc_info]
 
 
+@pytest.mark.parametrize("part", ["-wal", "-shm"])
+def test_what_was_committed_outlives_a_wal_or_shm_that_is_deleted_under_its_server(tmp_path: Path, part: str) -> None:
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            assert (await http.get("/jobs/before")).status_code == 200
+            (tmp_path / "data" / f"jobs.sqlite3{part}").unlink()
+            assert (await http.get("/readyz")).json()["status"] == "no_database"
+            assert (await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)).status_code == 503
+        async with (
+            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            assert [job["id"] for job in (await http.get("/jobs")).json()["jobs"]] == ["before"]
+
+    play(scenario)
+
+
 def test_many_requests_do_not_wait_for_a_lock_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

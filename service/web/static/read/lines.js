@@ -1,6 +1,8 @@
 // Text tables, line by line, without holding the whole text as one string.
 
 const BLOCK = 1 << 22;
+export const NUMBER = /^[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan(\((ind|snan)\))?|inf(inity)?|1\.#(ind|inf|[qs]nan)0*)$/i;
+export const MISSING = ["", "na", "null"]; // a cell of a delimited table without a number
 
 // Call visit(text, start, end) for every line behind byte `begin`, until it returns true.
 export function eachLine(bytes, begin, visit) {
@@ -23,7 +25,7 @@ export function isSpace(code) {
   return code === 32 || (code >= 9 && code <= 13) || code === 26; // Ctrl-Z, how DOS ends a file
 }
 
-// Read the numbers of some columns into out[at...], NaN for none; delimiter: a character code, or 0 for white space.
+// Read the numbers of some columns into out[at...], NaN for a missing one; delimiter: a character code, or 0 for white space.
 export function readColumns(text, start, end, delimiter, columns, out, at) {
   const last = Math.max(...columns);
   const isEnd = delimiter === 0 ? isSpace : (code) => code === delimiter;
@@ -38,15 +40,19 @@ export function readColumns(text, start, end, delimiter, columns, out, at) {
       if (isPaired && text.charCodeAt(stop) === 34) isQuoted = !isQuoted;
     }
     for (let axis = 0; axis < columns.length; axis++) {
-      if (columns[axis] === column) out[at + axis] = numberIn(text.slice(cursor, stop), quotes > 0);
+      if (columns[axis] === column) out[at + axis] = numberIn(text.slice(cursor, stop), delimiter, quotes > 0);
     }
     cursor = delimiter === 0 ? stop : stop + 1;
   }
 }
 
-function numberIn(cell, hasQuotes) {
+function numberIn(cell, delimiter, hasQuotes) {
   const bare = hasQuotes ? cell.replace(/^["\s]+|["\s]+$/g, "") : cell.trim();
-  return bare ? Number(bare) : NaN;
+  const value = bare ? Number(bare) : NaN;
+  if (Number.isNaN(value) && !NUMBER.test(bare) && !(delimiter && MISSING.includes(bare.toLowerCase()))) {
+    throw new Error(`${bare.slice(0, 40)} is no number`);
+  }
+  return value;
 }
 
 // A Float64Array that grows.

@@ -1,6 +1,6 @@
 // Positions of a text table (.xyz .csv .tsv .pts and the like), by the rules of points/formats/xyz.py and titles.py.
 
-import { Rows, eachLine, isSpace, readColumns } from "./lines.js";
+import { MISSING, NUMBER, Rows, eachLine, isSpace, readColumns } from "./lines.js";
 
 export const MARKS = [";", ","]; // what may stand between cells where it is not white space: the first that a row has
 const POSITIONS = [
@@ -21,12 +21,13 @@ const DEGREES = [["lat", "latitude"], ["lon", "lng", "long", "longitude"]];
 const UNIT = /\s*(\[.*\]|\(.*\))$/;
 const BEFORE_UNIT = /(?<!\s)\s+(?=[[(])/g;
 const LEAD = /^[^,;\t:]*:\s+/; // columns: x y z
-const NUMBER = /^[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan(\((ind|snan)\))?|inf(inity)?|1\.#(ind|inf|[qs]nan)0*)$/i;
+const PAIRS = /^[ \t-\r]*[-+]?\d+,\d+(,[ \t-\r]*[-+]?\d+,\d+){2,}[ \t-\r]*$/; // 0,5, 1,5, 2,5
 const SEPARATOR = /^"?sep=.?"?$/i; // Excel's first line
-const MISSING = ["", "na", "null"]; // a cell of a delimited table without a number
 const REMARKS = 20; // the last comments above a table, of which one may be its title
 const COUNTED = 10; // points: of fewer, an x may go up by one each
+const LOOKED_AT = 1 << 14; // bytes of the first rows, which tell decimal commas from cells
 const TAB = 9;
+const COMMA = 44;
 const UNKNOWN_NAMES = "names that do not say x, y, z";
 
 export function readXyz(bytes, marks = MARKS) {
@@ -38,14 +39,18 @@ export function readXyz(bytes, marks = MARKS) {
   const begin = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf ? 3 : 0;
   let numbered = null; // a line that is pandas' 0, 1, 2... or a point: the next one tells
   let counting = null; // whether x only counts the points, of a table without names
+  let pairs = null; // its first rows, where commas are between cells
   const row = (text, start, end) => {
     const at = rows.next(); // may replace rows.values
     readColumns(text, start, end, table.delimiter, table.axes, rows.values, at);
     if (counting?.isSo) counting.add(rows.values[at], text.slice(start, end));
+    if (pairs?.left > 0) pairs.add(text.slice(start, end));
   };
   const below = (line) => {
     table = layout(line, names, remarks, marks);
-    if (!table.isNamed && declared === null) counting = new Counting(table.delimiter);
+    if (table.isNamed || declared !== null) return;
+    counting = new Counting(table.delimiter);
+    if (table.delimiter === COMMA) pairs = new Pairs();
   };
   const above = (text, start, end, line, isComment) => {
     if (!line) return;
@@ -78,6 +83,7 @@ export function readXyz(bytes, marks = MARKS) {
     row(text, start, end);
   });
   if (numbered) decide("");
+  if (pairs?.areDecimals) throw new Error("decimals have a point here, no comma");
   if (counting?.isRefused) throw new Error("the first column counts the points, and nothing says which are x, y, z");
   return rows.xyz;
 }
@@ -102,6 +108,28 @@ class Counting {
 
   get isRefused() {
     return this.isSo && this.hasFourth && this.count >= COUNTED;
+  }
+}
+
+// As the server does: whether rows read as numbers with decimal commas that commas separate.
+class Pairs {
+  constructor() {
+    this.rows = [];
+    this.left = LOOKED_AT;
+  }
+
+  add(line) {
+    this.left -= line.length + 1;
+    if (this.left >= 0 || this.rows.length === 0) this.rows.push(line);
+  }
+
+  get areDecimals() {
+    if (!this.rows.every((row) => PAIRS.test(row))) return false;
+    const marks = this.rows.flatMap((row) => [...row.matchAll(/\d+,\d+(,[ \t-\r]*)/g)]);
+    if (marks.every(([, mark]) => mark.length > 1)) return true;
+    const decimals = this.rows.flatMap((row) => row.split(",").filter((_, cell) => cell % 2)).map(strip);
+    const areAsLong = decimals.every((cell) => cell.length === decimals[0].length);
+    return areAsLong && decimals[0].length > 1 && decimals.some((cell) => cell.startsWith("0"));
   }
 }
 

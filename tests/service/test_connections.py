@@ -1,0 +1,48 @@
+"""Connections on which nothing is to be answered: closed after a while, whatever came before."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from tests.service.in_process import serving
+from tests.service.test_races import CLOUD, play, willing
+
+REFUSED = b"PUT /nowhere HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n"
+GOOD = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+@pytest.mark.parametrize("parts", [[b""], [b"GET /li"], [GOOD, b"GET /li"], [REFUSED, b"1 2 3\n"]])
+def test_one_that_falls_silent_is_closed(tmp_path: Path, parts: list[bytes]) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing(), upload_idle_seconds=0.5) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            for part in parts:
+                writer.write(part)
+                await asyncio.sleep(0.2)
+            answer = await asyncio.wait_for(reader.read(), timeout=4)  # to the end: the server closes
+            assert answer.startswith(b"HTTP/1.1 ") == (len(parts) > 1)
+            writer.close()
+
+    play(scenario)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> None:
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend, upload_idle_seconds=0.3) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            made = b"PUT /jobs/a?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(CLOUD)
+            asked = b"GET /jobs/a?wait=1 HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+            writer.write(made + CLOUD)
+            first = b"" if together else await reader.readuntil(b"}}")
+            writer.write(asked)
+            answer = await asyncio.wait_for(reader.read(), timeout=20)
+            assert (first + answer).count(b"HTTP/1.1 20") == 2
+            writer.close()
+
+    play(scenario)
