@@ -190,7 +190,9 @@ class Run:
         """
         if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].sampling.irregular:
             return 0.0
-        return self.filter.processor.spread(positions, tiling, _SPREAD_LIMIT * self.readings[0].noise_std)
+        first = self.readings[0]
+        limit = _SPREAD_LIMIT * min(first.noise_std, first.sampling.noise_of_most)
+        return self.filter.processor.spread(positions, tiling, limit)
 
     def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all
