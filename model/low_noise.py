@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods
 
-__all__ = ["low_noise_weight", "noise_in_neighbourhoods", "wiener_weighted"]
+__all__ = ["NeighbourhoodNoise", "low_noise_weight", "wiener_weighted"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -47,17 +47,32 @@ class _Surfaces:
     normals: Floats
 
 
-def noise_in_neighbourhoods(near: Nearest) -> float:
-    """Return the noise of points of a patch, in radii of their neighbourhoods."""
-    here = _surfaces(near.first(_FIT_NEIGHBOURS))
-    return float(np.quantile(here.stds / here.radii, _NOISE_QUANTILE))
+@dataclass(frozen=True)
+class NeighbourhoodNoise:
+    """What surfaces fitted to neighbours leave of the points of a patch.
+
+    in_radii, std: their noise, in radii of the neighbourhoods and in the unit of the points; loud_share: how many of
+    them are many times that noise off their neighbours' surface.
+    """
+
+    in_radii: float
+    std: float
+    loud_share: float
+
+    @classmethod
+    def of(cls, near: Nearest) -> NeighbourhoodNoise:
+        """Look at the nearest points of some."""
+        here = _surfaces(near.first(_FIT_NEIGHBOURS))
+        std = float(np.quantile(here.stds, _NOISE_QUANTILE))
+        loud_share = float(np.mean(np.abs(here.own_residuals) > _OUTLIER_STDS * std))
+        return cls(float(np.quantile(here.stds / here.radii, _NOISE_QUANTILE)), std, loud_share)
 
 
 def low_noise_weight(ratios: Sequence[float]) -> float:
     """Say how little noise a cloud has beside the distances of its points, 0 to 1.
 
-    1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: as of `noise_in_neighbourhoods`,
-    for each of some patches, of which half say.
+    1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: as of
+    `NeighbourhoodNoise.in_radii`, for each of some patches, of which half say.
     """
     return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 

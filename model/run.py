@@ -18,6 +18,7 @@ from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import restrained_step, trusted_noise_stds
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
+from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
 from straightpcf.points.cloud import as_positions
 from straightpcf.points.errors import TooFewPoints
 from straightpcf.points.options import DenoiseOptions
@@ -91,6 +92,7 @@ class Run:
         self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held_back = np.zeros(len(self.moved), dtype=bool)
+        self.voxel = 0.0  # the edge of a cell, in the unit-ball frame, where the points are a bent surface's voxels
         self.readings: list[Reading] = []  # before each pass, and after the last
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
@@ -124,7 +126,14 @@ class Run:
             spread_step = self._spread_step(positions, tiling, planned)
             positions += spread_step
             tiling = self._tiling(positions, tiles)
-            self.readings.append(self.reader.read(positions, tiling, self.readings[0] if self.readings else None))
+            reading = self.reader.read(positions, tiling, self.readings[0] if self.readings else None)
+            if not self.readings and (edge := self._edge_of_steps(reading)):
+                self.voxel = edge
+                self.moved += within_voxels(len(positions), edge, self.options.seed)
+                positions += self.moved
+                tiling = self._tiling(positions, tiles)
+                reading = self.reader.read(positions, tiling, None)
+            self.readings.append(reading)
             left = self._passes_left(planned)
             if left == 0:
                 self.noise_after = self._noise_left(tiles)
@@ -132,6 +141,13 @@ class Run:
             self.iterations += 1
             self.moved += spread_step
             yield from self._pass(positions, tiling, left)
+
+    def _edge_of_steps(self, reading: Reading) -> float:
+        """Return the edge of a cell where the first reading is of the steps of a bent object's voxels, else 0."""
+        if reading.scene or not self.filter.zoom:
+            return 0.0
+        edge = edge_of_voxels(self.points.xyz) / self.frame.radius
+        return edge if are_steps(edge, reading.noise_std) else 0.0
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -147,6 +163,8 @@ class Run:
             warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
         if held_back := np.count_nonzero(self.held_back[self.points.inverse]):
             warnings.append(f"{held_back} points are on walls closer together than points are, and were held back")
+        if self.voxel:
+            warnings.append("the points are voxels: each was taken to be anywhere in its cell")
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
         elif len(self.points.xyz) < MIN_POINTS:
@@ -190,7 +208,9 @@ class Run:
         """
         if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].sampling.irregular:
             return 0.0
-        return self.filter.processor.spread(positions, tiling, _SPREAD_LIMIT * self.readings[0].noise_std)
+        first = self.readings[0]
+        limit = _SPREAD_LIMIT * min(first.noise_std, first.sampling.noise_of_most)
+        return self.filter.processor.spread(positions, tiling, limit)
 
     def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all

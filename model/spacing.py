@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.low_noise import low_noise_weight, noise_in_neighbourhoods
+from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
 from straightpcf.model.neighbourhoods import Nearest, inner_points
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Mapper
@@ -28,6 +28,9 @@ _IRREGULAR_STD_OF_WALLS = 0.2
 # The nearest other's area beside a 32nd of that of 32: 1.4 to 2 where points are even, 0.5 to 1 in lines, in grids of
 # cells of 1 : 2.5 and more, and by chance.
 _LINES_AREA_RATIO = 1.3
+# Where so many points are far off their neighbours' surface, and what was read is so many times the noise of the
+# others, it is the noise of those few.
+_LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
 _NEIGHBOURS_LOOKED_UP = 64  # what the statistics ask for
 _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, at most, and of all where they are few
@@ -35,17 +38,19 @@ _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, a
 
 @dataclass(frozen=True)
 class Sampling:
-    """How points lie before a pass; all but the last two as before the first.
+    """How points lie before a pass; all but thin_walls and uncovered as before the first.
 
     irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
-    uncovered: whether that was asked again once a pass had taken most of the noise.
+    uncovered: whether that was asked again once a pass had taken most of the noise; noise_of_most: the noise std of
+    most points, where a few have so much more that theirs is what is read of all, else infinite.
     """
 
     irregular: bool = False
     low_noise: float = 0.0
     thin_walls: bool = False
     uncovered: bool = False
+    noise_of_most: float = np.inf
 
     @classmethod
     def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, mapper: Mapper = map) -> Sampling:
@@ -57,8 +62,12 @@ class Sampling:
         found = list(mapper(measure, patches.index))
         thin_walls = has_walls([s.between_walls for s in found])
         areas = np.concatenate([s.areas for s in found])
+        noise = [s.noise for s in found]
+        noise_of_most = _noise_of_most(noise, noise_std)
+        noise_std = min(noise_std, noise_of_most)
         irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(areas, noise_std, thin_walls=thin_walls)
-        return cls(irregular, low_noise_weight([s.noise for s in found]), thin_walls)
+        low_noise = low_noise_weight([n.in_radii for n in noise])
+        return cls(irregular, low_noise, thin_walls, noise_of_most=noise_of_most)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
@@ -70,12 +79,11 @@ class Sampling:
 class _PatchStatistics:
     """What n points of a patch have around them.
 
-    areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; noise, between_walls: as of
-    `noise_in_neighbourhoods` and `between_walls`.
+    areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; between_walls: as of `between_walls`.
     """
 
     areas: Floats
-    noise: float
+    noise: NeighbourhoodNoise
     between_walls: list[bool]
 
     @classmethod
@@ -83,7 +91,7 @@ class _PatchStatistics:
         near = _nearest(xyz, samples, whole, rows)
         last = near.distances.shape[1] - 1
         areas = np.square(near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]])
-        return cls(areas, noise_in_neighbourhoods(near), between_walls(near))
+        return cls(areas, NeighbourhoodNoise.of(near), between_walls(near))
 
 
 def _looked_at(xyz: Floats, patches: Patches) -> tuple[Floats, int, bool]:
@@ -99,6 +107,16 @@ def _nearest(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]
 
 def _between_walls(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> list[bool]:
     return between_walls(_nearest(xyz, samples, whole, rows), uncovered=True)
+
+
+def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:
+    """Return the noise std that most points have, where a few loud ones are what was read as noise_std; else inf.
+
+    found: of some patches, of which half say. Where noise is as large as the distance between points, none is loud.
+    """
+    noise_of_most = float(np.median([noise.std for noise in found]))
+    loud = np.mean([noise.loud_share for noise in found]) > _LOUD_SHARE
+    return noise_of_most if loud and noise_std > _LOUD_RATIO * noise_of_most else np.inf
 
 
 def _is_irregular(areas: Floats, noise_std: float, *, thin_walls: bool) -> bool:

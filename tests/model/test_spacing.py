@@ -52,3 +52,33 @@ def test_points_that_lie_by_chance_end_nearer_to_where_they_were(noise_std: floa
     before, after = chamfer_distance(rough, clean), chamfer_distance(load_filter(threads=2).denoise(rough).xyz, clean)
     assert after < (before or at_most)
     assert after < at_most
+
+
+def loud(xyz: np.ndarray, noise_std: float) -> np.ndarray:
+    """Give one point in ten ten times the noise of the others."""
+    rng = np.random.default_rng(1)
+    stds = np.where(rng.random((len(xyz), 1)) < 0.1, 10 * noise_std, noise_std)
+    return xyz + stds * rng.standard_normal(xyz.shape)
+
+
+def test_a_few_points_with_much_more_noise_do_not_hide_how_the_others_lie() -> None:
+    read = 0.03  # as of all, by the rms
+    for cloud, by_chance in ((sphere(5000), True), (even_sphere(5000), False)):
+        rough = loud(cloud, 0.005)
+        sampling = Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), read)
+        assert sampling.irregular == by_chance
+        assert 0.003 < sampling.noise_of_most < 0.007
+
+
+@pytest.mark.parametrize("noise_std", [0.005, 0.01, 0.03])
+def test_what_all_points_have_is_not_the_noise_of_a_few(noise_std: float) -> None:
+    for cloud in (sphere(3000), even_sphere(3000)):
+        rough = noisy(cloud, noise_std)
+        patches = cut_patches(rough, coverage=3.0, seed=0)
+        assert Sampling.of(rough, patches, noise_std).noise_of_most == np.inf
+
+
+def test_points_that_lie_by_chance_are_not_spread_by_what_a_few_of_them_have() -> None:
+    clean = torus(3000)
+    result = load_filter(threads=2).denoise(loud(clean, 0.005))
+    assert chamfer_distance(result.xyz, clean) < 0.8 * chamfer_distance(loud(clean, 0.005), clean)
