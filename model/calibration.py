@@ -13,10 +13,9 @@ from straightpcf.points.errors import MalformedFile
 
 __all__ = ["Calibration"]
 
-_ONE_PASS_DISTANCE = 0.87  # d of noise that one pass takes most of
-# As `stuck`, where walls close together were seen at the start: of points that lie by chance a second pass would join
-# them, of even points, of whose d the first leaves less, it does good.
-_STUCK_BETWEEN_WALLS = 0.61
+# d of noise that one pass takes most of: little, and what leaves more of thin bodies (1.5 to 2 %).
+_LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
+_STUCK_WITH_MORE_NOISE = 0.7  # as `stuck`, of d between those two where no walls were seen
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Calibration:
     crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
     dense points the second leaves more than of few.
     stuck: where a second pass is due, but d after the first is more than this share of d at the start, and that was
-    below _ONE_PASS_DISTANCE, walls close together were read, not noise: further passes would join them.
+    below _LITTLE_NOISE_DISTANCE, walls close together were read, not noise, or rods: further passes would join them.
     stirred: d above which noise is left whatever was done. most: passes in all.
     """
 
@@ -41,7 +40,7 @@ class Calibration:
     polish: tuple[float, ...] = (0.45, 0.76, 0.905)
     settled: tuple[float, ...] = (0.2, 0.2, 0.2)
     crowded: float = 0.042
-    stuck: float = 0.7
+    stuck: float = 0.61
     stirred: float = 0.5
     most: int = 4
 
@@ -80,7 +79,8 @@ class Calibration:
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = 1 + sum(start > limit for limit in self.starts)
-        stuck = min(self.stuck, _STUCK_BETWEEN_WALLS) if thin_walls else self.stuck
+        little = thin_walls or start < _LITTLE_NOISE_DISTANCE
+        stuck = self.stuck if little else max(self.stuck, _STUCK_WITH_MORE_NOISE)
         if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)

@@ -29,7 +29,7 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
         (few, few, many, many) for few, many in product((0.14, 0.16, 0.18, 0.2, 0.22), (0.18, 0.2, 0.22, 0.25))
     ),
     "crowded": (0.042, 1.0),
-    "stuck": (0.7,),
+    "stuck": (0.61,),
     "stirred": (0.5,),
     "most": (5,),
 }

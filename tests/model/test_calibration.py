@@ -51,12 +51,22 @@ def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> 
     assert passes(Calibration(crowded=1.0), dense) == 2
 
 
-def test_between_walls_a_second_pass_is_made_only_after_a_first_that_took_much() -> None:
+@pytest.mark.parametrize(
+    ("start", "now", "thin_walls", "made"),
+    [
+        (0.66, 0.38, False, 2),
+        (0.66, 0.43, False, 1),  # walls, or rods
+        (0.79, 0.50, False, 2),  # a thin body with more noise
+        (0.83, 0.60, False, 1),
+        (0.83, 0.54, True, 1),
+        (0.90, 0.70, True, 2),  # so much noise that a pass hardly shows
+    ],
+)
+def test_a_second_pass_is_made_only_after_a_first_that_took_much(
+    start: float, now: float, thin_walls: bool, made: int
+) -> None:
     twice = Calibration(starts=(0.45,), polish=(), settled=())
-    for now, made in ((0.43, 1), (0.38, 2)):
-        distances = (0.66, now, 0.35, 0.35)
-        assert passes(twice, Trace("plain", 0.01, distances, ())) == 2
-        assert passes(twice, Trace("walls", 0.01, distances, (), thin_walls=True)) == made
+    assert passes(twice, Trace("walls", 0.01, (start, now, 0.35, 0.35), (), thin_walls=thin_walls)) == made
 
 
 def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
