@@ -52,6 +52,27 @@ async def locked(folder: Path) -> AsyncIterator[None]:
         yield
 
 
+@asynccontextmanager
+async def asking(
+    data_dir: Path, backend: ObedientBackend, *, timeout: float = 5.0
+) -> AsyncIterator[httpx2.AsyncClient]:
+    async with (
+        serving(data_dir, backend) as (_, host, port),
+        httpx2.AsyncClient(base_url=f"http://{host}:{port}", timeout=timeout) as http,
+    ):
+        yield http
+
+
+@asynccontextmanager
+async def at_work(data_dir: Path, backend: ObedientBackend) -> AsyncIterator[httpx2.AsyncClient]:
+    """Do as `asking`, while a job "before" is worked on until `backend.finish` is set."""
+    async with asking(data_dir, backend) as http:
+        backend.finish.clear()
+        assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+        await engines.until(lambda: backend.runs)
+        yield http
+
+
 @pytest.mark.parametrize("trouble", [gone, locked])
 def test_who_asks_is_told_so_and_served_when_it_is_over(
     tmp_path: Path, trouble: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -60,13 +81,7 @@ def test_who_asks_is_told_so_and_served_when_it_is_over(
     backend = willing()
 
     async def scenario() -> None:
-        async with (
-            serving(tmp_path / "data", backend) as (_, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
-            backend.finish.clear()
-            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
-            await engines.until(lambda: backend.runs)
+        async with at_work(tmp_path / "data", backend) as http:
             async with trouble(tmp_path / "data"):
                 answer = await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)
                 problem = answer.json()
@@ -90,13 +105,7 @@ def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that
     backend, names = willing(), [f"jobs.sqlite3{part}" for part in ("", "-wal", "-shm")]
 
     async def scenario() -> None:
-        async with (
-            serving(tmp_path / "data", backend) as (_, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
-            backend.finish.clear()
-            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
-            await engines.until(lambda: backend.runs)
+        async with at_work(tmp_path / "data", backend) as http:
             (away := tmp_path / "away").mkdir()
             for name in names:
                 (tmp_path / "data" / name).rename(away / name)
@@ -122,19 +131,13 @@ def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that
 @pytest.mark.parametrize("part", ["-wal", "-shm"])
 def test_what_was_committed_outlives_a_wal_or_shm_that_is_deleted_under_its_server(tmp_path: Path, part: str) -> None:
     async def scenario() -> None:
-        async with (
-            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
+        async with asking(tmp_path / "data", ObedientBackend()) as http:
             assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
             assert (await http.get("/jobs/before")).status_code == 200
             (tmp_path / "data" / f"jobs.sqlite3{part}").unlink()
             assert (await http.get("/readyz")).json()["status"] == "no_database"
             assert (await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)).status_code == 503
-        async with (
-            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
+        async with asking(tmp_path / "data", ObedientBackend()) as http:
             assert [job["id"] for job in (await http.get("/jobs")).json()["jobs"]] == ["before"]
 
     play(scenario)
@@ -146,10 +149,7 @@ def test_many_requests_do_not_wait_for_a_lock_one_after_the_other(
     monkeypatch.setattr(store_thread, "LOCK_SECONDS", 1.0)
 
     async def scenario() -> None:
-        async with (
-            serving(tmp_path / "data", ObedientBackend()) as (_, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}", timeout=60) as http,
-        ):
+        async with asking(tmp_path / "data", ObedientBackend(), timeout=60) as http:
             assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
             async with locked(tmp_path / "data"):
                 began = time.monotonic()
