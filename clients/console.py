@@ -12,7 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -38,6 +38,7 @@ __all__ = [
     "quiet_end",
     "say",
     "show_noise",
+    "to_stdout",
 ]
 
 INTERRUPTED = 130
@@ -244,9 +245,14 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         yield show
 
 
+def to_stdout() -> AbstractContextManager[None]:
+    """Name stdout in the error of a write to it that finds no room."""
+    return place_named(_STDOUT)
+
+
 def say(text: str) -> None:
     """Print a line on stdout."""
-    with place_named(_STDOUT):
+    with to_stdout():
         typer.echo(text)
 
 

@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from straightpcf.clients.atomic import check_target, place_named
-from straightpcf.clients.console import for_each, interruptible, print_json, print_table, progress_bar, say, show_noise
+from straightpcf.clients.atomic import check_target
+from straightpcf.clients.console import (
+    for_each,
+    interruptible,
+    print_json,
+    print_table,
+    progress_bar,
+    say,
+    show_noise,
+    to_stdout,
+)
 from straightpcf.clients.stdio import STDIO, content_of, input_name, is_stream, stdout
 from straightpcf.points.errors import InvalidOptions
 
@@ -151,7 +160,7 @@ def result(
             job.wait(on_progress=show)
         found = job.result(target if out is None else None)
         if out is not None:
-            with place_named("stdout"):
+            with to_stdout():
                 out.write(found.read())
                 out.flush()  # before it is said to be done
     if as_json and out is None:

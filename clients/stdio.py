@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from straightpcf.clients.atomic import place_named
+from straightpcf.clients.console import to_stdout
 from straightpcf.points.errors import InvalidRequest
 
 __all__ = ["STDIO", "content_of", "input_file", "input_name", "is_stream", "output_file", "stdout"]
@@ -79,7 +80,7 @@ def output_file(target: Path, suffix: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         with place_named(folder):
             yield (path := Path(folder) / f"result{suffix}")
-        with path.open("rb") as result, place_named("stdout"):
+        with path.open("rb") as result, to_stdout():
             shutil.copyfileobj(result, out)
             out.flush()
 
