@@ -42,7 +42,7 @@ from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.full_disk import DISK_TROUBLES, full_disk_as_spool_full
 from straightpcf.service.settings import Settings
 from straightpcf.service.telemetry import MetricsMiddleware, Telemetry
-from straightpcf.service.web import ASSET_PREFIX, install_page
+from straightpcf.service.web import install_page
 
 if TYPE_CHECKING:
     from straightpcf.service.api.grpc import GrpcServer
@@ -75,7 +75,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
     app = FastAPIOffline(  # /docs has its scripts here: many servers have no way out
         redoc_url=None,  # would ask its maker's server for a picture
-        favicon_url=f"{ASSET_PREFIX}icon.svg",
+        favicon_url="static/icon.svg",  # beside /docs, wherever a proxy has that
         title="StraightPCF",
         version=straightpcf.__version__,
         summary="Hand it a noisy point cloud, get the same points back on the surface.",
@@ -120,6 +120,7 @@ def serve(settings: Settings) -> None:
         _quiet_when_cut_off(app),
         host=settings.host,
         port=settings.port,
+        root_path=settings.root_path,
         timeout_graceful_shutdown=settings.shutdown_seconds,
         lifespan="on",
         http=connection_class(idle_seconds=settings.upload_idle_seconds),

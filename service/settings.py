@@ -20,6 +20,7 @@ _OF_OTHERS = frozenset({f"{ENVIRONMENT_PREFIX}{name}" for name in ("URL", "KEY",
 # What Kubernetes tells every pod of a Service whose name begins with straightpcf; PORT is a setting if it is a number.
 _SERVICE_LINK = re.compile(r"\w*_(SERVICE_(HOST|PORT\w*)|PORT_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?)")
 _SERVICE_URL = re.compile(r"(tcp|udp|sctp)://.+:\d+")
+_ROOT_PATH = re.compile(r"(/[\w.~-]+)*", re.ASCII)
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
@@ -46,6 +47,7 @@ class Settings:
     upload_idle_seconds: how long a body that has not come to its end may bring nothing.
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
+    root_path: where a proxy, which takes it off, has the server: "/straightpcf" for https://host/straightpcf/.
     allowed_hosts: comma-separated names by which a server without keys on loopback may be asked beside loopback's own.
     cors_origins: comma-separated origins whose pages may call the server; none by default.
     device: "auto" | "cpu" | "cuda" | "cuda:N"; several, with commas between, have a worker each.
@@ -72,6 +74,7 @@ class Settings:
     row_ttl_seconds: float = 86400.0
     api_keys: str = ""
     api_keys_file: Path | None = None
+    root_path: str = ""
     allowed_hosts: str = ""
     cors_origins: str = ""
     device: str = "auto"
@@ -100,6 +103,10 @@ class Settings:
         for name in ("port", "grpc_port"):
             if not 0 <= (getattr(self, name) or 0) < 2**16:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
+        if not _ROOT_PATH.fullmatch(self.root_path):
+            raise InvalidOptions(
+                f"root_path is {self.root_path[:80]!r}; it must be like /straightpcf, with no / at its end"
+            )
 
     def keys(self) -> tuple[str, ...]:
         """Return the API keys; raises InvalidOptions for a key that no header carries, and where none is left.

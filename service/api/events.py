@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 
 from starlette.responses import StreamingResponse
 
@@ -29,18 +29,20 @@ def last_event_id(header: str | None, query: str | None) -> int:
     return int(text)
 
 
-def event_stream(engine: Engine, id: str, owner: str, *, after: int = 0, headers: dict[str, str]) -> StreamingResponse:
+def event_stream(
+    engine: Engine, id: str, owner: str, *, root: str, after: int = 0, headers: Mapping[str, str] | None = None
+) -> StreamingResponse:
     """Answer with the events of a job that is known to be there, until it is finished."""
-    body = _kept_alive(_events(engine, id, owner, after))
-    return StreamingResponse(body, media_type=SSE_MEDIA_TYPE, headers={**_LIVE, **headers})
+    body = _kept_alive(_events(engine, id, owner, root, after))
+    return StreamingResponse(body, media_type=SSE_MEDIA_TYPE, headers={**_LIVE, **(headers or {})})
 
 
-async def _events(engine: Engine, id: str, owner: str, after: int) -> AsyncIterator[bytes]:
+async def _events(engine: Engine, id: str, owner: str, root: str, after: int) -> AsyncIterator[bytes]:
     try:
         async for event in engine.events(id, owner=owner, after=after):
             data = event.data
             if event.kind == "completed":
-                data = Job.of(await engine.get(id, owner=owner)).plain()
+                data = Job.of(await engine.get(id, owner=owner), root=root).plain()
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n".encode()
     except (NotFound, ServerBusy):
         return  # deleted while we looked, or the server ends: without `completed`, so that a client comes again

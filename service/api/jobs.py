@@ -38,10 +38,12 @@ router = APIRouter(tags=["jobs"])
 Owner = Annotated[str, Depends(owner_of)]
 
 
-def job_response(record: JobRecord, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
+def job_response(
+    request: Request, record: JobRecord, status: int, headers: dict[str, str] | None = None
+) -> JSONResponse:
     """Show a job, with the place where it is."""
-    at = {"Location": f"/jobs/{record.id}", **(headers or {})}
-    return JSONResponse(Job.of(record).plain(), status_code=status, headers=at)
+    job = Job.of(record, root=request.scope["root_path"])
+    return JSONResponse(job.plain(), status_code=status, headers={"Location": job.links.self, **(headers or {})})
 
 
 @router.post("/jobs/", include_in_schema=False, response_class=Response)  # curl takes a redirect for an answer
@@ -52,7 +54,7 @@ def job_response(record: JobRecord, status: int, headers: dict[str, str] | None 
 async def create_job(request: Request, owner: Owner) -> Response:
     """Take a cloud and answer at once; the job is on the disk by then."""
     record, created, _ = await take_job(request, owner, endpoint="jobs")
-    return job_response(record, 202 if created else 200)
+    return job_response(request, record, 202 if created else 200)
 
 
 @router.put(
@@ -62,7 +64,7 @@ async def create_job(request: Request, owner: Owner) -> Response:
 async def put_job(id: str, request: Request, owner: Owner) -> Response:
     """Make a job once, however often the same request comes."""
     record, created, _ = await take_job(request, owner, endpoint="jobs", id=id)
-    return job_response(record, 202 if created else 200)
+    return job_response(request, record, 202 if created else 200)
 
 
 @router.head("/jobs", include_in_schema=False)
@@ -79,7 +81,8 @@ async def list_jobs(
     """Show this key's jobs, newest first."""
     engine: Engine = request.app.state.engine
     records, next_cursor = await engine.list(owner=owner, states=state or (), limit=limit, cursor=cursor)
-    return JobPage(jobs=[Job.of(record) for record in records], next_cursor=next_cursor)
+    root = request.scope["root_path"]
+    return JobPage(jobs=[Job.of(record, root=root) for record in records], next_cursor=next_cursor)
 
 
 @router.head("/jobs/{id}", include_in_schema=False)
@@ -92,7 +95,7 @@ async def get_job(
 ) -> Job:
     """Show a job, as soon as it is finished or the wait is over."""
     engine: Engine = request.app.state.engine
-    return Job.of(await engine.wait(id, owner=owner, seconds=wait))
+    return Job.of(await engine.wait(id, owner=owner, seconds=wait), root=request.scope["root_path"])
 
 
 @router.get(
@@ -113,7 +116,7 @@ async def job_events(
         async with aclosing(engine.events(id, owner=owner, after=from_id)) as events:
             if await anext(events, None) is None:
                 return Response(status_code=204)  # which ends an EventSource; it connects again after anything else
-    return event_stream(engine, id, owner, after=from_id, headers={})
+    return event_stream(engine, id, owner, root=request.scope["root_path"], after=from_id)
 
 
 @router.post(
@@ -125,7 +128,7 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
     engine: Engine = request.app.state.engine
     before = await engine.get(id, owner=owner)
     after = await engine.cancel(id, owner=owner)
-    return job_response(after, 200 if before.finished else 202)
+    return job_response(request, after, 200 if before.finished else 202)
 
 
 @router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")

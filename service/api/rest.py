@@ -27,7 +27,7 @@ from straightpcf.service.api.openapi import (
     problems,
 )
 from straightpcf.service.api.prefer import parse_prefer
-from straightpcf.service.api.schemas import Health, Info
+from straightpcf.service.api.schemas import Health, Info, Job
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord
 
@@ -69,9 +69,12 @@ async def denoise(request: Request, owner: Owner) -> Response:
     prefer = parse_prefer(request.headers.getlist("prefer"))
     record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
     if asks_for(",".join(request.headers.getlist("accept")), SSE_MEDIA_TYPE):
-        return event_stream(engine, record.id, owner, headers={"Location": f"/jobs/{record.id}"})
+        root = request.scope["root_path"]
+        return event_stream(
+            engine, record.id, owner, root=root, headers={"Location": Job.of(record, root=root).links.self}
+        )
     if prefer.respond_async and prefer.wait is None:
-        return job_response(record, 202, prefer.applied(finished=False))
+        return job_response(request, record, 202, prefer.applied(finished=False))
     # Nobody else knows the id of such a job: it lives as long as its request.
     private = not prefer.stated and "idempotency-key" not in request.headers
     longest = engine.limits.max_sync_seconds
@@ -86,7 +89,7 @@ async def denoise(request: Request, owner: Owner) -> Response:
         record = await engine.get(record.id, owner=owner)
     applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
-        return job_response(record, 202, applied)
+        return job_response(request, record, 202, applied)
     cleanup = None
     if private:
         engine.lend(record.id, owner=owner)

@@ -150,9 +150,9 @@ class Job(BaseModel):
     links: Links
 
     @classmethod
-    def of(cls, record: JobRecord) -> Job:
-        """Render a job of the store."""
-        at = f"/jobs/{record.id}"
+    def of(cls, record: JobRecord, *, root: str = "") -> Job:
+        """Render a job of the store; root: the path under which clients find the server, of the ASGI scope."""
+        at = f"{root}/jobs/{record.id}"
         plain = ("id", "state", "name", "format", "bytes", "points", "progress", "attempts", "position", "created_at",
                  "started_at", "finished_at", "expires_at")  # fmt: skip
         error, result = record.error, record.result

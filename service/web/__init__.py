@@ -14,7 +14,7 @@ from fastapi.responses import Response
 from straightpcf.points.errors import NotFound
 from straightpcf.service.api.negotiate import asks_for
 
-__all__ = ["ASSET_PREFIX", "install_page"]
+__all__ = ["install_page"]
 
 ASSET_PREFIX = "/static/"  # needs no API key, like "/" itself
 

@@ -15,6 +15,7 @@ from straightpcf.points.formats import read_cloud
 from tests.clouds import noisy, sphere
 from tests.conftest import RunningServer
 from tests.e2e.conftest import POINTS
+from tests.proxy import behind_proxy
 from tests.waiting import wait_for
 
 
@@ -38,6 +39,20 @@ def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path
     noisy_, _ = read_cloud(scan)
     assert clean.xyz.shape == (POINTS, 3)
     assert 0 < np.abs(clean.xyz - noisy_.xyz).max() < 0.2
+
+
+def test_the_page_works_under_a_path_of_a_proxy(page: Any, scan: Path, server: RunningServer, tmp_path: Path) -> None:
+    with behind_proxy(server.url, "/lab/straightpcf") as url:
+        page.goto(f"{url}/")
+        page.set_input_files("#file", scan)
+        page.select_option("#iterations", "1")
+        page.click("#submit")
+        page.wait_for_selector("#report:not([hidden])")
+        with page.expect_download() as download:
+            page.click("#download")
+        download.value.save_as(tmp_path / "clean.ply")
+        page.goto("about:blank")
+    assert len(read_cloud(tmp_path / "clean.ply")[0]) == POINTS
 
 
 def test_the_api_is_documented_without_a_way_out(page: Any, server: RunningServer) -> None:
