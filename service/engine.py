@@ -180,7 +180,7 @@ class Engine:
         """Commit one job, or find the one that the same request made; return it and whether it is new.
 
         One that may run again is made anew, under its id. Raises ServerBusy, SpoolFull, QuotaExceeded, TooManyBytes,
-        UnknownFormat, IdConflict, IdempotencyConflict.
+        MalformedFile of an empty file, UnknownFormat, IdConflict, IdempotencyConflict.
         """
         size = source.stat().st_size
         self.limits.check_bytes(size)
@@ -188,7 +188,7 @@ class Engine:
             format_named(request.format)  # raises before anything waits
         _check_id(request.id)
         content, weight = await asyncio.to_thread(
-            lambda: (digest_of(source), estimate_points(source, name=request.name))
+            lambda: (digest_of(source), estimate_points(source, name=request.name or "the cloud"))
         )
         said = [request.endpoint, asdict(request.options), request.name, request.format, content]
         new = NewJob(

@@ -60,13 +60,18 @@ _PACKED = {
 
 
 def estimate_points(path: Path, *, name: str | None = None) -> int:
-    """Guess how many points a file holds without reading it; never more than its bytes could be."""
+    """Guess how many points a file holds without reading it; never more than its bytes could be.
+
+    Raises MalformedFile if it is empty.
+    """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     size = path.stat().st_size
     try:
         return min(recognised(head, name or path.name).estimate(head, size), size)
     except (StraightPCFError, ValueError, struct.error):
+        if size == 0:
+            raise
         return size // 16  # reading it will say what is wrong
 
 

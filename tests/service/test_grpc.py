@@ -99,6 +99,17 @@ def test_denoise_streams_patches_the_file_and_a_summary(server: RunningServer, s
     wait_for(lambda: not server.spooled_files())
 
 
+def test_an_empty_file_is_refused_at_once(server: RunningServer, stub: Any) -> None:
+    config = pb.JobConfig(filename="a.ply", id="empty")
+    for call in (
+        lambda: stub.CreateJob(parts(pb.CreateJobRequest, config, b"")),
+        lambda: list(stub.Denoise(parts(pb.DenoiseRequest, pb.DenoiseConfig(job=config), b""))),
+    ):
+        status, info = error_of(call)
+        assert (status, info.reason) == ("INVALID_ARGUMENT", "MALFORMED_FILE")
+    assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
+
+
 def test_denoise_without_patches_tells_progress(stub: Any) -> None:
     answers = list(stub.Denoise(denoise_parts(SMALL)))
     told = [answer.progress.progress for answer in answers if answer.WhichOneof("part") == "progress"]

@@ -114,3 +114,18 @@ def test_what_refuses_a_job_whatever_its_body_is_said_before_it_comes(tmp_path: 
             assert f'"code":"{code}"'.encode() in answer
 
     play(scenario)
+
+
+@pytest.mark.parametrize("form", [False, True], ids=["raw", "form"])
+@pytest.mark.parametrize("path", ["/denoise", "/jobs"])
+def test_an_empty_file_is_refused_at_once(server: RunningServer, path: str, form: bool) -> None:
+    for name in ("a.ply", "a.xyz", ""):
+        if form:
+            answer = httpx2.post(f"{server.url}{path}", files={"file": (name, b"")})
+        else:
+            answer = httpx2.post(f"{server.url}{path}?filename={name}", content=b"")
+        assert (answer.status_code, answer.json()["code"]) == (422, "malformed_file")
+        assert answer.json()["detail"] == f"{name or 'the cloud'} is empty (0 bytes)"
+    assert httpx2.put(f"{server.url}/jobs/empty", headers={"Content-Length": "0"}).status_code == 422
+    assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
+    assert not server.spooled_files()

@@ -92,8 +92,6 @@ _PLY = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float
 
 
 BAD_BODIES = {
-    "empty": ("scan.ply", b"", {"malformed_file", "unknown_format"}),
-    "empty without a name": (None, b"", {"malformed_file", "unknown_format"}),
     "wrong magic": ("scan.ply", b"GIF89a" + bytes(range(256)), {"malformed_file", "unknown_format"}),
     "no format at all": (None, bytes(range(256)), {"unknown_format"}),
     "truncated binary": ("scan.ply", _PLY % (b"binary_little_endian", 500) + bytes(700), {"malformed_file"}),
