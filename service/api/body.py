@@ -107,7 +107,9 @@ async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, lim
     form = _Form(spool.buffer)
     received, chunks = 0, request.stream()
     try:
-        parser = MultipartParser(boundary, form.callbacks())
+        parser = MultipartParser(boundary, {"on_part_end": lambda: parser.callbacks.update(form.callbacks())})
+        # Text before the first boundary is to be ignored (RFC 2046, 5.1.1): a part, to the parser, that nobody hears.
+        parser.write(b"--" + boundary + b"\r\n\r\n\r\n")
         while (chunk := await next_part(chunks, limits)) is not None:
             limits.check_bytes(received := received + len(chunk))
             parser.write(chunk)
@@ -115,7 +117,9 @@ async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, lim
     except FormParserError as exc:
         raise InvalidRequest(f"the form breaks the multipart format: {exc}") from exc
     if not form.ended:
-        raise InvalidRequest(f"the form ends after {received} bytes without its closing boundary")
+        raise InvalidRequest(
+            f"the form ends after {received} bytes without the closing boundary that its Content-Type names"
+        )
     if not form.has_file:
         raise InvalidRequest(f'the form has no file in a field named "{FILE_FIELD}"')
     return form.upload

@@ -95,6 +95,33 @@ def test_a_form_whose_boundary_is_not_said_is_told_so(server: RunningServer) -> 
         assert "names no boundary" in answer.json()["detail"]
 
 
+@pytest.mark.parametrize("size", [1, 7, 10_000])
+@pytest.mark.parametrize(
+    "preamble", [b"", b"\r\n", b"This is a message with multiple parts - in MIME format.\r\n", b"--c\r\n"]
+)
+def test_what_stands_before_a_forms_first_boundary_is_ignored(
+    server: RunningServer, preamble: bytes, size: int
+) -> None:
+    cloud = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in XYZ[:50]).encode()
+    form = b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.xyz"\r\n\r\n' + cloud + b"\r\n--b--\r\n"
+    whole = preamble + form + b"and behind the last"
+    made = httpx2.put(
+        f"{server.url}/jobs/form",
+        content=(whole[at : at + size] for at in range(0, len(whole), size)),
+        headers={"Content-Type": "multipart/form-data; boundary=b"},
+    )
+    assert made.status_code == 202, made.text
+    assert (made.json()["name"], made.json()["bytes"]) == ("a.xyz", len(cloud))
+
+
+@pytest.mark.parametrize("body", [b"", b"0 0 0\r\n", b"--c\r\n\r\n--c--\r\n", b"--b\r\n", b"text\r\n--b"])
+def test_a_form_without_the_boundary_that_it_names_is_told_so(server: RunningServer, body: bytes) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=b"}
+    answer = httpx2.post(f"{server.url}/jobs", content=body, headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (400, "invalid_request")
+    assert "without the closing boundary" in answer.json()["detail"]
+
+
 @pytest.mark.parametrize(("id", "code"), [(".hidden", "invalid_request"), ("second", "quota_exceeded")])
 def test_what_refuses_a_job_whatever_its_body_is_said_before_it_comes(tmp_path: Path, id: str, code: str) -> None:
     async def scenario() -> None:
