@@ -157,8 +157,11 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
     kept = WRITTEN.intersection(field.label for field in header.fields)
     tokens: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]] = {name: [] for name in kept}
     left, line = header.points, header.lines + 1
-    for lines, _ in blocks(raw, header.size) if left else ():
-        filled = np.flatnonzero(lines.counts)[:left]  # PCL skips blank lines
+    for lines, _ in blocks(raw, header.size):
+        filled = np.flatnonzero(lines.counts)  # PCL skips blank lines
+        if len(filled) > left and lines.counts[filled[left]] == width:
+            raise MalformedFile(f"PCD POINTS is {header.points}, and line {line + filled[left]} is one more")
+        filled = filled[:left]
         rows, numbers = lines.pick(filled), line + filled
         line += len(lines)
         wrong = rows.counts != width
@@ -180,8 +183,6 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
         for name in kept:
             tokens[name].append(columns[name])
         left -= len(rows)
-        if left == 0:
-            break
     if left:
         raise MalformedFile(
             f"PCD POINTS is {header.points}, the file ends after {header.points - left}: it is truncated"

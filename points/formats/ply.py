@@ -27,7 +27,7 @@ from straightpcf.points.formats.positions import (
     widened,
 )
 from straightpcf.points.formats.scalars import scalar_columns
-from straightpcf.points.formats.text import refuse_binary, replaced
+from straightpcf.points.formats.text import blocks, refuse_binary, replaced
 
 __all__ = ["Ply"]
 
@@ -141,9 +141,22 @@ def _find(raw: bytes, header: PlyHeader, vertex: PlyElement) -> tuple[int, Ascii
         if element is vertex:
             found = at, rows
         at = rows.end
+    if header.is_ascii and element is vertex:
+        _refuse_more(raw, at, vertex, line)
     if found is None:  # pragma: no cover - _vertex has looked
         raise MalformedFile("the PLY file has no element vertex")
     return found
+
+
+def _refuse_more(raw: bytes, begin: int, vertex: PlyElement, line: int) -> None:
+    """Raise where one more vertex follows than the header declares: it would stay as it is."""
+    for lines, _ in blocks(raw, begin):
+        if lines.counts.any():
+            first = int(np.argmax(lines.counts > 0))
+            if lines.counts[first] == len(vertex.properties):
+                raise MalformedFile(f"element vertex declares {vertex.count} rows, and line {line + first} is one more")
+            return
+        line += len(lines)
 
 
 def _values(raw: bytes, vertex: PlyElement, rows: BinaryRows) -> dict[str, npt.NDArray[Any]]:

@@ -61,9 +61,10 @@ class Xyz(Format):
 
     x, y, z are the columns that a line of names above the table says, and the first three where there is none
     (`titles`). Refused are names of more than three columns that say nothing of positions, or that are of more or fewer
-    columns than the table has, and more than three columns without names whose first counts the points. Between commas
-    or semicolons a cell that is empty, `NA` or `null` is NaN, and one in quotes may hold them. Comment lines (`#`,
-    `//`), blank lines, lines with the number of points and columns of any text are kept.
+    columns than the table has, and more than three columns without names whose first counts the points, or whose first
+    two number a scanner's rows and columns. Between commas or semicolons a cell that is empty, `NA` or `null` is NaN,
+    and one in quotes may hold them. Comment lines (`#`, `//`), blank lines, lines with the number of points and columns
+    of any text are kept.
     """
 
     name = "xyz"
@@ -91,6 +92,8 @@ class Xyz(Format):
         starts, ends, columns, texts = _table(raw, layout, max_points)
         if not layout.is_named:
             _refuse_counted(columns, layout.line)
+            if len(starts) and all(raw[starts[0, axis] : ends[0, axis]].isdigit() for axis in (0, 1)):
+                _refuse_numbered(columns, layout.line)
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
         attributes = {layout.names[column]: values for column, values in columns.items()}
         source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
@@ -249,6 +252,26 @@ def _refuse_counted(columns: Mapping[int, npt.NDArray[Any]], line: int) -> None:
         raise UnsupportedCloud(
             f"the first of {max(columns) + 1} columns counts the points from {first[0]:.0f} on, and nothing above line "
             f"{line} says which are x, y, z: put a line of names there, such as `id x y z`"
+        )
+
+
+def _refuse_numbered(columns: Mapping[int, npt.NDArray[Any]], line: int) -> None:
+    """Raise where the first two columns, whole numbers, seem to number a scanner's rows and columns, as FARO's do.
+
+    They stand in the order of one of the two, and the three columns behind them have decimals in most rows, where a
+    grid has z and perhaps a colour.
+    """
+    if not {3, 4} <= columns.keys() or len(columns[0]) < _COUNTED:
+        return
+    numbers = [columns[0], columns[1]]
+    with np.errstate(invalid="ignore"):  # of infinities
+        are_whole = all((column >= 0).all() and (column % 1 == 0).all() for column in numbers)
+        are_in_order = any((step >= 0).all() or (step <= 0).all() for step in map(np.diff, numbers))
+        have_decimals = all((columns[axis] % 1 > 0).mean() > 0.5 for axis in (2, 3, 4))
+    if are_whole and are_in_order and have_decimals:
+        raise UnsupportedCloud(
+            f"the first two of {max(columns) + 1} columns look like a scanner's rows and columns, and nothing above "
+            f"line {line} says which are x, y, z: put a line of names there, such as `row column x y z`"
         )
 
 

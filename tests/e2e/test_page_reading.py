@@ -11,7 +11,7 @@ import pytest
 
 from straightpcf.points.formats import format_named, read_cloud
 from tests.points.test_xyz import TABBED, TABLES
-from tests.points.test_xyz_refused import MALFORMED
+from tests.points.test_xyz_refused import GRIDS, MALFORMED, scanned
 
 POSITIONS = "async ([b, name]) => [...(await import('/static/read/index.js')).readPositions(new Uint8Array(b), name)]"
 
@@ -62,6 +62,19 @@ def test_the_page_refuses_a_first_column_that_counts_the_points_as_the_server_do
     assert answer([f"{n + 0.5} 0 1 7" for n in range(50)]) == 150
     assert answer([f"{n} 0 1 7" for n in range(9)]) == 27
     assert answer([f"{2 * n} 0 1 7" for n in range(50)]) == 150
+
+
+def test_the_page_refuses_a_scanners_rows_and_columns_as_the_server_does(page: Any) -> None:
+    said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031
+    for separator, name in ((" ", "a.txt"), (",", "a.csv"), ("\t", "a.tsv")):
+        for more in ("", "0.5", "10 20 oak"):
+            rows = scanned(separator, more)
+            raw = "\n".join(rows).encode()
+            assert "number rows and columns" in str(page.evaluate(said, [list(raw), name])), (separator, more)
+            names = separator.join(["row", "column", "x", "y", "z", *"abc"[: len(more.split())]]).encode()
+            assert page.evaluate(said, [list(names + b"\n" + raw), name]) == 3 * len(rows)
+    for case, rows in GRIDS.items():
+        assert page.evaluate(said, [list("\n".join(rows).encode()), "a.txt"]) == 3 * len(rows), case
 
 
 def test_the_page_refuses_names_as_the_server_does(page: Any) -> None:

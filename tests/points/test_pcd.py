@@ -51,6 +51,12 @@ def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None
     assert _written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"4 5 6 8", b"4 5 6.5 8")
 
 
+def test_more_rows_than_points_are_refused(tmp_path: Path) -> None:
+    """They would come back as they were, among points that were denoised."""
+    with pytest.raises(MalformedFile, match=r"PCD POINTS is 3, and line 18 is one more"):
+        _read(tmp_path, HEADER + b"1 2 3 7\n4 5 6 8\n\n7 8 9 9\n\n1 1 1 1\n")
+
+
 def test_keywords_may_stand_before_tabs(tmp_path: Path) -> None:
     raw = HEADER.replace(b"# made by hand\n", b"").replace(b" ", b"\t") + b"1 2 3 7\n4 5 6 8\n7 8 9 9\n"
     assert _read(tmp_path, raw).xyz[2].tolist() == [7, 8, 9]

@@ -250,6 +250,11 @@ MALFORMED: dict[str, tuple[bytes, type[InvalidCloud], str]] = {
     "no number": (header(ASCII, "element vertex many", *AXES), MalformedFile, "line 3.*many"),
     "huge number": (header(ASCII, f"element vertex {10**30}", *AXES), MalformedFile, "line 3"),
     "truncated": (header(BINARY, *VERTICES) + bytes(47), MalformedFile, "48 bytes.* 47"),
+    "one vertex more": (
+        header(ASCII, *VERTICES) + b"0 0 0\n" * 4 + b"\n0 0 0\n",
+        MalformedFile,
+        "4 rows, and line 13 is",
+    ),
     "truncated text": (header(ASCII, *VERTICES) + b"0 0 0\n" * 3, MalformedFile, "4 rows"),
     "short row": (header(ASCII, *VERTICES) + b"0 0 0\n0 0\n0 0 0\n0 0 0\n0\n", MalformedFile, "line 9.* 2 values"),
     "long row": (header(ASCII, *VERTICES) + b"0 0 0 0\n" * 4, MalformedFile, "line 8.* 4 values"),

@@ -52,6 +52,42 @@ def test_an_x_that_only_looks_like_it_is_one(rows: list[str], tmp_path: Path) ->
     np.testing.assert_array_equal(cloud.xyz[:, 0], [float(row.split()[0]) for row in rows])
 
 
+def scanned(separator: str = " ", more: str = "") -> list[str]:
+    """Return rows as FARO SCENE exports them: row and column of the scanner, x, y, z, and what follows."""
+    numbers = [(row, column) for column in range(30, 40) for row in range(7) if (row + column) % 5]
+    cells = [[str(r), str(c), f"{-0.31 * r - 0.01:.4f}", f"{0.17 * c:.4f}", f"1.{r}05"] for r, c in numbers]
+    return [separator.join([*row, *more.split()]) for row in cells]
+
+
+@pytest.mark.parametrize("separator", [" ", ",", "\t"])
+@pytest.mark.parametrize("more", ["", "0.5", "10 20 oak"])
+def test_a_scanners_rows_and_columns_are_never_taken_for_x_and_y(separator: str, more: str, tmp_path: Path) -> None:
+    rows, suffix = scanned(separator, more), "tsv" if separator == "\t" else "xyz"
+    for raw in (rows, sorted(rows, key=lambda row: int(row.split(separator)[0])), rows[::-1]):
+        with pytest.raises(UnsupportedCloud, match=r"scanner's rows and columns.*line of names"):
+            read(tmp_path, "\n".join(raw).encode(), f"a.{suffix}")
+    names = separator.join(["row", "column", "x", "y", "z", *"rgb"[: len(more.split())]])
+    named = read(tmp_path, "\n".join([names, *rows]).encode(), f"b.{suffix}")
+    np.testing.assert_array_equal(named.xyz[0], [float(cell) for cell in rows[0].split(separator)[2:5]])
+
+
+GRIDS = {
+    "a height map": [f"{n % 10} {n // 10} 1.5" for n in range(50)],
+    "with a colour": [f"{n % 10} {n // 10} 1.5 10 20 30" for n in range(50)],
+    "with an intensity and a class": [f"{n % 10} {n // 10} 1.5 0.25 2" for n in range(50)],
+    "written with decimals": [f"{n % 10}.0 {n // 10}.0 1.5 0.6 0.8" for n in range(50)],
+    "below zero": [f"{n % 10 - 5} {n // 10} 1.5 0.6 0.8" for n in range(50)],
+    "in no order": [f"{7 * n % 50} {3 * n % 11} 1.5 0.6 0.8" for n in range(50)],
+    "of few points": scanned()[:9],
+}
+
+
+@pytest.mark.parametrize("case", GRIDS)
+def test_a_grid_of_whole_numbers_is_read_as_it_stands(case: str, tmp_path: Path) -> None:
+    cloud = read(tmp_path, "\n".join(GRIDS[case]).encode())
+    np.testing.assert_array_equal(cloud.xyz, [[float(cell) for cell in row.split()[:3]] for row in GRIDS[case]])
+
+
 MALFORMED = {
     "bad token": (b"1 2 3\n4 5 6\n\n7 8,9 0\n", r"line 4, column 2.*8,9"),
     "a name among numbers": (b"x y z\n1 2 3\n1 z 3\n", r"line 3, column 2.*z"),

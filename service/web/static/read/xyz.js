@@ -39,17 +39,20 @@ export function readXyz(bytes, marks = MARKS) {
   const begin = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf ? 3 : 0;
   let numbered = null; // a line that is pandas' 0, 1, 2... or a point: the next one tells
   let counting = null; // whether x only counts the points, of a table without names
+  let numbering = null; // whether x and y number a scanner's rows and columns there
   let pairs = null; // its first rows, where commas are between cells
   const row = (text, start, end) => {
     const at = rows.next(); // may replace rows.values
     readColumns(text, start, end, table.delimiter, table.axes, rows.values, at);
     if (counting?.isSo) counting.add(rows.values[at], text.slice(start, end));
+    if (numbering?.isSo) numbering.add(rows.values.subarray(at, at + 3), text.slice(start, end));
     if (pairs?.left > 0) pairs.add(text.slice(start, end));
   };
   const below = (line) => {
     table = layout(line, names, remarks, marks);
     if (table.isNamed || declared !== null) return;
     counting = new Counting(table.delimiter);
+    numbering = new Numbering(table.delimiter);
     if (table.delimiter === COMMA) pairs = new Pairs();
   };
   const above = (text, start, end, line, isComment) => {
@@ -85,6 +88,7 @@ export function readXyz(bytes, marks = MARKS) {
   if (numbered) decide("");
   if (pairs?.areDecimals) throw new Error("decimals have a point here, no comma");
   if (counting?.isRefused) throw new Error("the first column counts the points, and nothing says which are x, y, z");
+  if (numbering?.isRefused) throw new Error("the first columns number rows and columns, and nothing says which are x, y, z");
   return rows.xyz;
 }
 
@@ -108,6 +112,40 @@ class Counting {
 
   get isRefused() {
     return this.isSo && this.hasFourth && this.count >= COUNTED;
+  }
+}
+
+// As the server does: whether the first two columns, whole numbers in the order of one of them, number a scanner's rows
+// and columns, beside three that have decimals in most rows.
+class Numbering {
+  constructor(delimiter) {
+    this.marks = delimiter ? [String.fromCharCode(delimiter)] : [];
+    this.isSo = true;
+    this.orders = new Set(["0+", "0-", "1+", "1-"]); // of which columns, up or down, that were kept so far
+    this.decimals = [0, 0, 0];
+    this.last = null;
+    this.count = 0;
+  }
+
+  add([first, second, third], line) {
+    const cells = words(line, this.marks);
+    const behind = cells.slice(3, 5);
+    const areNumbers = behind.every((cell) => NUMBER.test(cell) || (this.marks.length > 0 && MISSING.includes(cell.toLowerCase())));
+    const numbers = [first, second];
+    const areWhole = numbers.every((number) => Number.isInteger(number) && number >= 0);
+    this.isSo = behind.length === 2 && areNumbers && areWhole && (this.last !== null || cells.slice(0, 2).every((cell) => /^\d+$/.test(cell)));
+    for (const column of this.last ? [0, 1] : []) {
+      if (numbers[column] < this.last[column]) this.orders.delete(`${column}+`);
+      if (numbers[column] > this.last[column]) this.orders.delete(`${column}-`);
+    }
+    this.isSo &&= this.orders.size > 0;
+    [third, ...behind.map(Number)].forEach((value, column) => (this.decimals[column] += value % 1 ? 1 : 0)); // NaN has none
+    this.last = numbers;
+    this.count++;
+  }
+
+  get isRefused() {
+    return this.isSo && this.count >= COUNTED && this.decimals.every((some) => some > this.count / 2);
   }
 }
 
