@@ -32,6 +32,7 @@ from straightpcf.service.api.jobs import router as jobs_router
 from straightpcf.service.api.openapi import document_problems
 from straightpcf.service.api.request_id import RequestIdMiddleware
 from straightpcf.service.api.rest import router
+from straightpcf.service.api.target import TargetMiddleware
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
@@ -98,6 +99,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         app.add_middleware(
             CORSMiddleware, allow_origins=origins, allow_methods=["*"], allow_headers=["*"], expose_headers=["*"]
         )
+    app.add_middleware(TargetMiddleware)
     install_error_handlers(app)
     app.include_router(router)
     app.include_router(jobs_router)

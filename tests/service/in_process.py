@@ -24,7 +24,9 @@ async def serving(folder: Path, backend: ObedientBackend, **settings: Any) -> As
     chosen = Settings(data_dir=folder, **{"shutdown_seconds": 1} | settings)
     app = create_app(chosen, backend=backend)
     http = connection_class(idle_seconds=chosen.upload_idle_seconds)
-    config = uvicorn.Config(app, port=0, log_config=None, http=http, ws="none", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(
+        app, port=0, root_path=chosen.root_path, log_config=None, http=http, ws="none", timeout_graceful_shutdown=1
+    )
     server = uvicorn.Server(config)
     task = asyncio.create_task(server.serve())
     while not server.started:

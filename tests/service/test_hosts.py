@@ -72,6 +72,37 @@ def test_a_server_with_keys_or_on_another_address_answers_for_any(tmp_path: Path
     assert not refused(asked(tmp_path / "open", OTHER, host="0.0.0.0"))
 
 
+async def answer_to(line: str, host: str, port: int) -> bytes:
+    reader, writer = await asyncio.open_connection(host, port)
+    writer.write(f"{line} HTTP/1.1\r\nConnection: close\r\nHost: localhost\r\n\r\n".encode())
+    answer = await reader.read()
+    writer.close()
+    return answer
+
+
+@pytest.mark.parametrize("root", ["", "/lab"])
+def test_a_request_line_may_name_the_host_and_that_counts(tmp_path: Path, root: str) -> None:
+    """As in RFC 9112, 3.2.2, of clients that take this server for their proxy, and of proxies that pass it on so."""
+    lines = {
+        "GET http://localhost:8000/livez": b"200",
+        "GET HTTP://me@127.0.0.1/jobs?limit=1": b"200",
+        "GET http://localhost/jobs?limit=0": b"422",
+        "GET http://localhost": b"200",
+        "GET http://localhost/http://localhost/livez": b"404",
+        "DELETE https://localhost/jobs/a%20b": b"404",
+        "GET http://evil.example/livez": b"421",
+    }
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing(), root_path=root) as (_, host, port):
+            for line, status in lines.items():
+                answer = await answer_to(line, host, port)
+                assert answer.split()[1] == status, line
+                assert b"'a b'" in answer or "%20" not in line
+
+    play(scenario)
+
+
 OWN_PAGES = ["http://localhost:8000", "https://127.0.0.1", "http://[::1]:1", "http://a.localhost:3000"]
 OTHER_PAGES = [
     "http://evil.example",
