@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -67,7 +67,10 @@ def get(id: str) -> Flow[JobInfo]:
 
 def page(states: Collection[str], limit: int, cursor: str | None) -> Flow[tuple[list[JobInfo], str | None]]:
     """Return a page of jobs and the cursor of the next one."""
-    body = yield request.list_call(states, limit, cursor), Body()
+    return (yield request.list_call(states, limit, cursor), Body(_page))  # type: ignore[no-any-return]
+
+
+def _page(body: Mapping[str, Any]) -> tuple[list[JobInfo], str | None]:
     return [JobInfo.parse(job) for job in body["jobs"]], body["next_cursor"] or None
 
 

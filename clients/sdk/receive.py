@@ -34,11 +34,11 @@ class Receiver(Protocol):
 
 
 class Body:
-    """Hold a whole JSON body, read by `parse`; None where there is none (204)."""
+    """Hold a whole JSON body, read by `parse`; without it none is expected (204)."""
 
     furthest = 0
 
-    def __init__(self, parse: Callable[[Any], Any] = lambda body: body) -> None:
+    def __init__(self, parse: Callable[[Any], Any] | None = None) -> None:
         self._parse = parse
         self._bytes = bytearray()
         self.value: Any = None
@@ -57,7 +57,7 @@ class Body:
 
     def finish(self) -> Failure | None:
         """Read them."""
-        if self._bytes:
+        if self._parse is not None:
             try:
                 self.value = self._parse(json.loads(self._bytes))
             except (ValueError, KeyError, TypeError) as exc:

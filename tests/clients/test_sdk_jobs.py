@@ -7,7 +7,7 @@ import hashlib
 import socket
 import threading
 import time
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -292,19 +292,24 @@ def test_closing_what_follows_a_job_ends_its_request_at_once() -> None:
     asyncio.run(follow())
 
 
-def test_a_server_of_another_kind_is_called_so() -> None:
+@pytest.mark.parametrize("body", [b"hola", b"", b"null", b"[]", b'{"jobs": [1]}'])
+@pytest.mark.parametrize(
+    "ask", [Client.info, lambda client: client.jobs.get("a"), lambda client: [*client.jobs.list()]]
+)
+def test_a_server_of_another_kind_is_called_so(body: bytes, ask: Callable[[Client], object]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def answer() -> None:
             connection, _ = listener.accept()
             with connection:
                 connection.recv(65536)
-                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\nConnection: close\r\n\r\nhola")
+                head = b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\nConnection: close\r\n\r\n" % len(body)
+                connection.sendall(head + body)
 
         threading.Thread(target=answer, daemon=True).start()
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         with Client(url) as client, pytest.raises(ConnectionFailed, match="no StraightPCF server"):
-            client.info()
+            ask(client)
 
 
 def test_a_timeout_ends_a_call_whatever_the_server_does(client: Client) -> None:
