@@ -93,6 +93,10 @@ def _check(url: str, api_key: str | None, timeout: float | None, max_retries: in
         raise InvalidOptions("the API key holds more than printable ASCII, which no header can carry")
     if api_key is not None and (not api_key or api_key != api_key.strip()):
         raise InvalidOptions("the API key is empty, or begins or ends with a space")
+    if api_key is not None and without_password(url) != url:
+        raise InvalidOptions(
+            f"{without_password(url)[:80]!r} names a user: a request carries that or the API key, not both"
+        )
 
 
 class Attempts:

@@ -196,6 +196,13 @@ def test_a_key_that_no_header_keeps_is_refused_at_once(key: str) -> None:
         Client("http://127.0.0.1:8000", api_key=key)
 
 
+def test_a_key_beside_a_password_in_the_url_is_refused_as_it_would_not_be_sent() -> None:
+    for make in (Client, AsyncClient):
+        with pytest.raises(InvalidOptions, match=r"'http://127\.0\.0\.1:1/x' names a user.*API key") as found:
+            make("http://user:secret@127.0.0.1:1/x", api_key="key")
+        assert "secret" not in str(found.value)
+
+
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
     moved = canned("301 Moved Permanently", "", "Location: https://clouds.example/healthz")
     refused = pytest.raises(InvalidRequest, match=r"https://clouds\.example/healthz")
