@@ -70,9 +70,12 @@ def failed_response(response: httpx2.Response) -> Failure:
     problem = _problem(response)
     request_id = problem.get("request_id") or response.headers.get("X-Request-Id")
     kind = ERRORS_BY_CODE.get(str(problem.get("code")), _kind_of_status(response.status_code))
-    detail = str(problem.get("detail") or f"HTTP {response.status_code} {response.reason_phrase}")
+    told = f"HTTP {response.status_code} {response.reason_phrase}"
     if response.is_redirect and (place := response.headers.get("Location")):
-        detail += f" to {place[:200]}: give the address that it ends at"
+        told += f" to {place[:200]}: give the address that it ends at"
+    else:
+        told += ", of a proxy or another server"
+    detail = str(problem.get("detail") or told)
     return Failure(
         error=kind(detail, request_id=request_id),
         retryable=bool(problem.get("retryable", response.status_code in (429, *_GATEWAY))),

@@ -23,6 +23,7 @@ from straightpcf.points.errors import (
     InvalidRequest,
     MissingDependency,
     ServerBusy,
+    TooManyBytes,
 )
 
 
@@ -201,6 +202,14 @@ def test_a_key_beside_a_password_in_the_url_is_refused_as_it_would_not_be_sent()
         with pytest.raises(InvalidOptions, match=r"'http://127\.0\.0\.1:1/x' names a user.*API key") as found:
             make("http://user:secret@127.0.0.1:1/x", api_key="key")
         assert "secret" not in str(found.value)
+
+
+def test_an_error_of_a_proxy_is_not_taken_for_the_servers() -> None:
+    for status, kind in (("413 Request Entity Too Large", TooManyBytes), ("502 Bad Gateway", ConnectionFailed)):
+        page = canned(status, "<html>nginx</html>", "Content-Type: text/html")
+        refused = pytest.raises(kind, match=f"HTTP {status}, of a proxy")
+        with answering(page) as (url, _), Client(url, max_retries=0) as client, refused:
+            client.health()
 
 
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -293,6 +294,16 @@ def test_an_answer_of_a_proxy_that_wants_a_login_is_explained(page: Any, scan: P
     page.evaluate("sessionStorage.setItem('straightpcf.jobs', '[\"a\"]')")
     page.reload()
     page.wait_for_selector("#error:has-text('log in')")
+
+
+@pytest.mark.parametrize(("status", "said"), [(413, "proxy.*no file of this size"), (403, "proxy.*403")])
+def test_an_error_of_a_proxy_is_not_taken_for_the_servers(page: Any, scan: Path, status: int, said: str) -> None:
+    html = {"body": "<html>nginx</html>", "content_type": "text/html"}
+    page.route("**/jobs/*?*", lambda route: route.fulfill(status=status, **html))
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.wait_for_selector("#error:not([hidden])")
+    assert re.search(said, page.inner_text("#error"))
 
 
 def test_lengths_are_written_as_people_read_them(page: Any) -> None:

@@ -111,6 +111,7 @@ function problemFrom(status, text, requestId) {
     return new Problem({ status, code, detail: detail ?? title ?? `The server answered ${status}.`, requestId: request_id, retryable });
   } catch {
     const retryable = status === 429 || status >= 502;
-    return new Problem({ status, code: "error", detail: `The server answered ${status}.`, requestId: requestId ?? "", retryable });
+    const detail = status === 413 ? "A proxy before the server takes no file of this size." : `A proxy before the server answered ${status}.`;
+    return new Problem({ status, code: "error", detail, requestId: requestId ?? "", retryable });
   }
 }
