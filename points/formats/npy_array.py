@@ -88,6 +88,7 @@ def read_header(head: bytes, *, where: str) -> NpyHeader:
     """Parse the header at the beginning of `head` (HEADER_BYTES of the array are enough)."""
     if not head.startswith(MAGIC):
         raise MalformedFile(f"{where} does not begin with the NPY magic, but with {head[:6]!r}")
+    check_room(8, len(head), what=f"the NPY header of {where}")
     version = tuple(head[6:8])
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise MalformedFile(f"{where} has NPY version {'.'.join(map(str, version))}; 1.0, 2.0 and 3.0 exist")

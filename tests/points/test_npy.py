@@ -181,6 +181,7 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "a point a column of an archive": (npz(points=np.zeros((6, 50))), UnsupportedCloud, r"points\.npy.*transpose"),
     "an image of points": (npy(np.zeros((4, 5, 3))), UnsupportedCloud, r"\(4, 5, 3\).*reshape\(-1, 3\)"),
     "three dimensions": (npy(np.zeros((5, 3, 3))), UnsupportedCloud, r"\(5, 3, 3\)"),
+    "truncated version": (npy(np.zeros((5, 3)))[:7], MalformedFile, "header .* 8 bytes.* 7: it is truncated"),
     "truncated": (npy(np.zeros((5, 3)))[:-1], MalformedFile, "120 bytes.* 119"),
     "no header": (b"\x93NUMPY\x01\x00", MalformedFile, "header"),
     "version 9": (b"\x93NUMPY\x09\x00" + bytes(100), MalformedFile, "9"),
