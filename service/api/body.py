@@ -25,6 +25,8 @@ MAX_FIELD_BYTES = 1024
 WRITE_BYTES = 2**20
 LOOK_SECONDS = 0.25
 
+_AS_IT_IS = (b"binary", b"8bit", b"7bit")  # of a part of a form: RFC 7578, 4.7
+
 _T = TypeVar("_T")
 
 
@@ -173,6 +175,8 @@ class _Form:
         name, value = self._header
         if name.lower() == b"content-disposition":
             self._disposition = bytes(value)
+        if name.lower() == b"content-transfer-encoding" and value.strip().lower() not in _AS_IT_IS:
+            raise UnknownFormat(f"a part of the form is encoded as {_text(value)[:40]!r}; send it as it is")
         self._header = (bytearray(), bytearray())
 
     def _on_headers_finished(self) -> None:

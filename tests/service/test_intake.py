@@ -79,6 +79,14 @@ def test_a_packed_body_is_refused_and_not_taken_for_points(server: RunningServer
     assert httpx2.put(url, content=npy(), headers={"Content-Encoding": "identity"}, timeout=60).status_code == 200
 
 
+def test_a_packed_part_of_a_form_is_refused_too(server: RunningServer) -> None:
+    for coding, status in (("base64", 415), ("quoted-printable", 415), ("Binary", 202), ("8bit", 202)):
+        files = {"file": ("a.npy", npy(), "application/octet-stream", {"Content-Transfer-Encoding": coding})}
+        answer = httpx2.post(f"{server.url}/jobs?iterations=1", files=files)
+        assert answer.status_code == status, coding
+        assert status == 202 or coding in answer.json()["detail"]
+
+
 def test_text_without_a_name_is_told_to_bring_one(server: RunningServer) -> None:
     answer = httpx2.post(f"{server.url}/denoise", content=b"0 0 0\n" * 50, timeout=60)
     assert answer.json()["code"] == "unknown_format"
