@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import re
 from collections.abc import Iterator, Mapping
@@ -15,22 +13,23 @@ from typing import IO
 from straightpcf.clients.atomic import replaced_when_complete
 from straightpcf.clients.sdk.retry import Failure
 from straightpcf.points.errors import ConnectionFailed
+from straightpcf.points.wire.jobs import ResultInfo
 
 __all__ = ["Download"]
 
 MAX_DAMAGED = 2  # how often a file may arrive with a wrong digest before we give up
-_CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
-_SHA256 = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
+_CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(?:\d+|\*)")
 
 
 class Download:
-    """Take a file in pieces, over as many connections as it needs; `furthest` only grows."""
+    """Take a file in pieces, over as many connections as it needs; `furthest` only grows.
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
+    What the job says of its result is what must arrive: headers may be lost on the way, or be of another's answer.
+    """
+
+    def __init__(self, file: IO[bytes], result: ResultInfo) -> None:
+        self._file, self._result = file, result
         self._etag: str | None = None
-        self._digest: bytes | None = None
-        self._size: int | None = None
         self._offset = 0
         self._wanted = False
         self._damaged = 0
@@ -40,14 +39,14 @@ class Download:
 
     @classmethod
     @contextmanager
-    def into(cls, path: Path | None) -> Iterator[tuple[Download, IO[bytes]]]:
+    def into(cls, path: Path | None, result: ResultInfo) -> Iterator[tuple[Download, IO[bytes]]]:
         """Begin a download into memory, or into a file that is there only if the block ends well."""
         if path is None:
             buffer = BytesIO()
-            yield cls(buffer), buffer
+            yield cls(buffer, result), buffer
             return
         with replaced_when_complete(path) as unfinished, unfinished.open("wb") as file:
-            yield cls(file), file
+            yield cls(file, result), file
 
     def headers(self) -> dict[str, str]:
         """Return what asks for the rest of the file that was begun."""
@@ -58,19 +57,13 @@ class Download:
     def begin(self, status: int, headers: Mapping[str, str]) -> None:
         """Take the head of a 200 or 206 response; an answer that is not the rest of the file starts it anew."""
         found = _CONTENT_RANGE.fullmatch(headers.get("Content-Range", "")) if status == 206 else None
-        if status == 206 and found is not None and int(found[1]) == self._offset:
-            if found[2] != "*":
-                self._size = int(found[2])
+        if found is not None and int(found[1]) == self._offset:
             return
         self._restart()
         if status == 206:
             return  # the wrong part: write() drops it, and finish() asks again
         self._wanted = True
         self._etag = headers.get("ETag")
-        if "Content-Encoding" not in headers and (length := headers.get("Content-Length", "")).isdigit():
-            self._size = int(length)
-        digest = _SHA256.search(headers.get("Repr-Digest", ""))
-        self._digest = None if digest is None else _decoded(digest[1])
 
     def write(self, chunk: bytes) -> None:
         """Take the next bytes."""
@@ -84,10 +77,10 @@ class Download:
         """Say what is wrong when a connection has ended, None if the file is whole."""
         if not self._wanted:
             return Failure(error=ConnectionFailed("the server sent another part of the file"), retryable=True)
-        if self._size is not None and self._offset < self._size:
-            missing = f"{self._offset} of {self._size} bytes arrived"
+        if self._offset < self._result.bytes:
+            missing = f"{self._offset} of {self._result.bytes} bytes arrived"
             return Failure(error=ConnectionFailed(f"the connection broke off: {missing}"), retryable=True)
-        if self._digest is not None and self._sha256.digest() != self._digest:
+        if self._sha256.hexdigest() != self._result.sha256:
             self._damaged += 1
             error = ConnectionFailed(f"{self._offset} bytes arrived, and their sha256 is not the one that was promised")
             self._restart()
@@ -99,13 +92,5 @@ class Download:
         self._file.seek(0)
         self._file.truncate()
         self._sha256 = hashlib.sha256()
-        self._digest = self._size = None
         self._offset = 0
         self._wanted = False
-
-
-def _decoded(text: str) -> bytes | None:
-    try:
-        return base64.b64decode(text, validate=True)
-    except binascii.Error:
-        return None

@@ -146,7 +146,7 @@ def fetch(job: JobInfo, target: Path | None, *, source: Source = None, request_i
         raise job.failure
     if job.result is None or job.report is None:
         raise JobNotFinished(f"job {job.id} is {job.state}, {100 * job.progress:.0f} % done")
-    with Download.into(target) as (download, file):
+    with Download.into(target, job.result) as (download, file):
         yield request.result_call(job.id), download
         content = None if target is not None else file.getvalue()  # type: ignore[attr-defined]
     return Denoised(job=job, request_id=request_id, content=content, path=target, source=source)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -138,12 +137,9 @@ class Answer:
     def _begin_file(self, result: pb.ResultInfo) -> None:
         asked = self._receiver.headers().get("Range")
         offset = int(asked.removeprefix("bytes=").removesuffix("-")) if asked else 0
-        digest = base64.b64encode(bytes.fromhex(result.sha256)).decode()
-        headers = {"ETag": f'"{result.sha256}"', "Repr-Digest": f"sha-256=:{digest}:"}
+        headers = {"ETag": f'"{result.sha256}"'}
         if offset:
             headers["Content-Range"] = f"bytes {offset}-{result.bytes - 1}/{result.bytes}"
-        else:
-            headers["Content-Length"] = str(result.bytes)
         self._receiver.begin(206 if offset else 200, headers)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -25,6 +27,8 @@ from straightpcf.points.errors import (
     ServerBusy,
     TooManyBytes,
 )
+from tests.clouds import noisy, torus
+from tests.conftest import RunningServer
 
 
 @contextmanager
@@ -210,6 +214,20 @@ def test_an_error_of_a_proxy_is_not_taken_for_the_servers() -> None:
         refused = pytest.raises(kind, match=f"HTTP {status}, of a proxy")
         with answering(page) as (url, _), Client(url, max_retries=0) as client, refused:
             client.health()
+
+
+def test_a_page_that_a_proxy_sends_for_a_result_is_not_taken_for_one(server: RunningServer, tmp_path: Path) -> None:
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(400), 0.01), iterations=1)
+        job.wait()
+        told = canned("200 OK", json.dumps(job.info.json))
+    login = canned("200 OK", "<html>log in</html>", "Content-Type: text/html")
+    cut = pytest.raises(ConnectionFailed, match="bytes arrived")
+    with answering(told, login) as (url, _), Client(url, max_retries=0) as client:
+        proxied = client.jobs.get(job.id)
+        with cut:
+            proxied.result(tmp_path / "clean.npy")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
