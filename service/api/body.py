@@ -22,6 +22,7 @@ __all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "next_part", "rece
 FILE_FIELD = "file"
 MAX_FIELDS = 20
 MAX_FIELD_BYTES = 1024
+MAX_PREAMBLE_BYTES = 2**16
 WRITE_BYTES = 2**20
 LOOK_SECONDS = 0.25
 
@@ -115,6 +116,10 @@ async def _receive_form(request: Request, boundary: bytes, spool: SpoolFile, lim
         while (chunk := await next_part(chunks, limits)) is not None:
             limits.check_bytes(received := received + len(chunk))
             parser.write(chunk)
+            if not form.begun and received > MAX_PREAMBLE_BYTES:
+                raise InvalidRequest(
+                    f"the boundary that Content-Type names is not in the form's first {received} bytes"
+                )
             await spool.flush(above=WRITE_BYTES)
     except FormParserError as exc:
         raise InvalidRequest(f"the form breaks the multipart format: {exc}") from exc
@@ -149,7 +154,7 @@ class _Form:
     def __init__(self, sink: bytearray) -> None:
         self.upload = Upload()
         self.has_file = False
-        self.ended = False
+        self.begun = self.ended = False
         self._file = sink
         self._header = (bytearray(), bytearray())
         self._disposition = b""
@@ -169,6 +174,7 @@ class _Form:
         }
 
     def _on_part_begin(self) -> None:
+        self.begun = True
         self._disposition = b""
 
     def _on_header_end(self) -> None:

@@ -13,6 +13,7 @@ import pytest
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 from tests.service.in_process import serving
+from tests.service.rest import raw
 from tests.service.test_races import CLOUD, play, willing
 
 XYZ = noisy(torus(400), 0.01)
@@ -128,6 +129,14 @@ def test_a_form_without_the_boundary_that_it_names_is_told_so(server: RunningSer
     answer = httpx2.post(f"{server.url}/jobs", content=body, headers=headers)
     assert (answer.status_code, answer.json()["code"]) == (400, "invalid_request")
     assert "without the closing boundary" in answer.json()["detail"]
+
+
+def test_a_long_form_of_another_boundary_is_refused_before_it_is_all_there(server: RunningServer) -> None:
+    head = "POST /jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+    begun = f"{head}Content-Length: 100000000\r\n\r\n".encode() + b"--c\r\n" + bytes(100_000)
+    problem = raw(server, begun).problem()
+    assert (problem["status"], problem["code"]) == (400, "invalid_request")
+    assert "boundary that Content-Type names" in problem["detail"]
 
 
 @pytest.mark.parametrize(("id", "code"), [(".hidden", "invalid_request"), ("second", "quota_exceeded")])
