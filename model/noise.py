@@ -17,14 +17,16 @@ from straightpcf.model.normalize import (
     patch_scales,
     zoom_of,
     zoom_of_each,
+    zoom_of_flat,
     zoom_of_rest,
 )
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
+from straightpcf.model.raster import is_raster
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["NoiseReader", "Reading"]
+__all__ = ["NoiseReader", "Reading", "ScenePatches"]
 
 # d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
 # From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
@@ -39,6 +41,7 @@ _UNCOVERED_BELOW = 0.35
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
+_FLAT_PATCH_STDS = 1.3  # a patch is flat where its points lie so many of its noise stds from their plane, or nearer
 
 
 @dataclass(frozen=True)
@@ -46,12 +49,13 @@ class Reading:
     """What was read of a cloud before a pass.
 
     distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole; sampling: how its points lie; zoom: the factor by which the pass shows an object larger; parts:
-    in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its patches, before the
-    first pass (a scene's are all shown in one size, and d says as much); known_distances: what the DistanceModule said
-    of patches of that pass, by number; noise_of_most: the noise std that four fifths of a scene's points have, or less;
-    high_noise: whether an object has more noise than HIGH_NOISE, before the first pass; uneven: whether that pass shows
-    no patch larger than the noise in it asks for.
+    object seen whole, a raster among them; sampling: how its points lie; zoom: the factor by which the pass shows an
+    object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
+    patches, before the first pass (a scene's are shown in sizes of their own, and d says as much); known_distances:
+    what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
+    scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
+    uneven: whether that pass shows no patch larger than the noise in it asks for; raster: whether the cloud is a height
+    for every cell of a grid.
     """
 
     distance: float
@@ -65,6 +69,23 @@ class Reading:
     noise_of_most: float = 0.0
     high_noise: bool = False
     uneven: bool = False
+    raster: bool = False
+
+
+@dataclass(frozen=True)
+class ScenePatches:
+    """How a pass shows patches of a scene, and what was read of them so, all (M,).
+
+    usual_distances: what the DistanceModule says of them in the usual size; scales, distances: in which size each is
+    shown, and what it says of them there; noise_stds: the noise of each, in the unit ball; flat: whether that is all
+    that keeps it from being flat.
+    """
+
+    usual_distances: Floats
+    scales: Floats
+    distances: Floats
+    noise_stds: Floats
+    flat: npt.NDArray[np.bool_]
 
 
 class NoiseReader:
@@ -84,23 +105,16 @@ class NoiseReader:
         size than that of the reading, d is read in that size, too.
         """
         probes, numbers = tiling.probes()
-        scene = is_scene(_quantile(probes.radii, probes.owned, 0.5)) if first is None else first.scene
-        scales = patch_scales(probes.radii, scene=scene)
+        raster = is_raster(positions) if first is None else first.raster
+        scene = raster or is_scene(_quantile(probes.radii, probes.owned, 0.5)) if first is None else first.scene
+        if scene:
+            return self._read_scene(positions, tiling, probes, raster=raster, first=first is None)
+        scales = patch_scales(probes.radii, scene=False)
         distances = self._processor.distances(positions, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
-        if scene:
-            noise, of_most, parts = self._read_scene(positions, tiling, probes, distances, scales, first=first is None)
-            return Reading(
-                distance,
-                noise,
-                scene,
-                Sampling(irregular=True),
-                parts=parts,
-                known_distances=known if parts == (1,) else {},
-                noise_of_most=of_most,
-            )
         noise = self._noise_std(distances, scales)
-        zoom, parts, in_radii, high_noise, uneven = 1.0, (1,), 0.0, False, False
+        zoom, in_radii, high_noise, uneven = 1.0, 0.0, False, False
+        parts: tuple[int, ...] = (1,)
         mapper = self._processor.mapper
         if first is None:
             sampling = Sampling.of(positions, probes, noise, mapper=mapper)
@@ -119,13 +133,32 @@ class NoiseReader:
             elif first.high_noise and noise > _REREAD_FROM * self._largest_noise:
                 zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
         if uneven or parts != (1,):  # patches are shown in other sizes, or are others
-            return Reading(
-                distance, noise, scene, sampling, zoom, parts, in_radii, high_noise=high_noise, uneven=uneven
-            )
-        if zoom != 1.0:
+            known = {}
+        elif zoom != 1.0:
             distances = self._processor.distances(positions, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(distance, noise, scene, sampling, zoom, parts, in_radii, known, high_noise=high_noise)
+        return Reading(
+            distance, noise, False, sampling, zoom, parts, in_radii, known, high_noise=high_noise, uneven=uneven
+        )
+
+    def of_scene(self, positions: Floats, cut: Patches, *, raster: bool) -> ScenePatches:
+        """Look at patches of a scene: each has the usual size, and what is flat but for its noise a smaller one.
+
+        So has every one of a raster, whose noise is in its heights alone.
+        """
+        scales = patch_scales(cut.radii, scene=True)
+        distances = usual = self._processor.distances(positions, cut, scales)
+        noise = self.noise_stds(distances, scales)
+        thickness = np.array([_thickness(positions[rows]) for rows in cut.index])
+        zoom = zoom_of_flat(noise * scales) if self._zoom else np.ones(len(scales))
+        if (smaller := zoom < 1).any():
+            zoomed = (zoom * scales)[smaller]
+            read = self._processor.distances(positions, cut[smaller], zoomed)
+            of_zoomed = self.noise_stds(read, zoomed)
+            shown = raster | (thickness[smaller] < _FLAT_PATCH_STDS * of_zoomed)
+            rows, distances = np.flatnonzero(smaller)[shown], usual.copy()
+            scales[rows], distances[rows], noise[rows] = zoomed[shown], read[shown], of_zoomed[shown]
+        return ScenePatches(usual, scales, distances, noise, thickness < _FLAT_PATCH_STDS * noise)
 
     def zooms(self, positions: Floats, cut: Patches, reading: Reading) -> Floats | float:
         """Return the factor by which a pass shows its patches larger: of each, (M,), or of all."""
@@ -150,31 +183,31 @@ class NoiseReader:
             noise, most, enough = again, self._largest_noise / zoom, _REREAD_ABOVE
         return noise
 
-    def _read_scene(
-        self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, *, first: bool
-    ) -> tuple[float, float, tuple[int, ...]]:
-        """Return the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
-        noise, noise_of_most = self._noise_of_scene(probes, distances, scales)
-        if np.isfinite(noise_of_most) or not (first and self._zoom):
-            return noise, noise_of_most, (1,)
-        noise, noise_of_most = self._reread_scene(positions, tiling, noise)
-        return noise, noise_of_most, parts_of(noise, probes.radii, len(positions))
+    def _read_scene(self, positions: Floats, tiling: Tiling, probes: Patches, *, raster: bool, first: bool) -> Reading:
+        """Read the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
+        shown = self.of_scene(positions, probes, raster=raster)
+        parts: tuple[int, ...] = (1,)
+        noise, noise_of_most = self._noise_of_scene(shown, probes)
+        if not np.isfinite(noise_of_most) and first and self._zoom:
+            noise, noise_of_most = self._reread_scene(positions, tiling, noise, raster=raster)
+            parts = parts_of(noise, probes.radii, len(positions))
+        distance = float(np.median(shown.usual_distances))
+        sampling = Sampling(irregular=True)
+        return Reading(distance, noise, True, sampling, parts=parts, noise_of_most=noise_of_most, raster=raster)
 
-    def _noise_of_scene(self, probes: Patches, distances: Floats, scales: Floats) -> tuple[float, float]:
+    def _noise_of_scene(self, shown: ScenePatches, probes: Patches) -> tuple[float, float]:
         """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""
-        shown = self._calibration.noise_std(distances)
-        noise, noise_of_most = (_quantile(shown / scales, probes.owned, share) for share in (0.5, _MOST_POINTS_SHARE))
-        beyond = _quantile(shown, probes.owned, _MOST_POINTS_SHARE) >= _REREAD_ABOVE * self._largest_noise
-        return noise, np.inf if beyond else noise_of_most
+        noise, noise_of_most = (_quantile(shown.noise_stds, probes.owned, share) for share in (0.5, _MOST_POINTS_SHARE))
+        as_shown = _quantile(shown.noise_stds * shown.scales, probes.owned, _MOST_POINTS_SHARE)
+        return noise, np.inf if as_shown >= _REREAD_ABOVE * self._largest_noise else noise_of_most
 
-    def _reread_scene(self, positions: Floats, tiling: Tiling, noise: float) -> tuple[float, float]:
+    def _reread_scene(self, positions: Floats, tiling: Tiling, noise: float, *, raster: bool) -> tuple[float, float]:
         """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
         noise_of_most = np.inf
         for zoom in _REREAD_ZOOMS:
             some = self._subsampled(positions, tiling, zoom)
             probes, _ = self._tile(some).probes(_REREAD_PROBES)
-            scales = patch_scales(probes.radii, scene=True)
-            again, noise_of_most = self._noise_of_scene(probes, self._processor.distances(some, probes, scales), scales)
+            again, noise_of_most = self._noise_of_scene(self.of_scene(some, probes, raster=raster), probes)
             noise = max(noise, again)
             if np.isfinite(noise_of_most):
                 break
@@ -227,3 +260,9 @@ def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> flo
     order = np.argsort(values)
     below = np.cumsum(owned[order] if owned.any() else np.ones(len(order)))
     return float(values[order][np.searchsorted(below, share * below[-1])])
+
+
+def _thickness(points: Floats) -> float:
+    """Return the rms distance of points (n, 3) from the plane that fits them best."""
+    local = points - points.mean(axis=0)
+    return float(np.sqrt(max(np.linalg.eigvalsh(local.T @ local)[0], 0.0) / len(points)))

@@ -18,6 +18,7 @@ __all__ = [
     "patch_scales",
     "zoom_of",
     "zoom_of_each",
+    "zoom_of_flat",
     "zoom_of_rest",
 ]
 
@@ -25,6 +26,7 @@ __all__ = [
 # to 50K points, 0.13, at augmentation's smallest scale, and the 99th (docs/training-log.md, "The first run").
 SMALLEST_RADIUS, LARGEST_RADIUS = 0.1, 0.58
 _MEDIAN_RADIUS = 0.25  # their median
+_FLAT_NOISE = 0.004  # the std that a flat patch's noise is brought to, within limits: see `zoom_of_flat`
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
@@ -100,6 +102,16 @@ def zoom_of_each(noise_stds: npt.NDArray[np.float64], zoom: float) -> npt.NDArra
     Where noise is not the same all over an object, its noisiest parts would be shown with more than the network bears.
     """
     return np.clip(_SHOWN_NOISE / np.maximum(noise_stds, 1e-9), _SMALLEST_ZOOM, zoom)
+
+
+def zoom_of_flat(noise_stds: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the factors, 1 at most, by which a scene's flat patches are shown smaller: (M,), for noise stds (M,).
+
+    noise_stds: in the frame in which they have the usual size. What is flat but for its noise has nothing to lose, and
+    the smaller its noise is shown the less of it the network takes for shape (docs/filter.md has the figures). They
+    get no smaller than any patch in training.
+    """
+    return np.clip(_FLAT_NOISE / np.maximum(noise_stds, 1e-9), SMALLEST_RADIUS / _MEDIAN_RADIUS, 1.0)
 
 
 def zoom_of_rest(noise_std: float, at_half_size: float) -> float:

@@ -34,7 +34,11 @@ class Patches:
 
     def every(self, step: int) -> Patches:
         """Return each step-th patch."""
-        return Patches(self.seeds[::step], self.index[::step], self.owned[::step], self.radii[::step])
+        return self[slice(None, None, step)]
+
+    def __getitem__(self, some: slice | npt.NDArray[np.bool_]) -> Patches:
+        """Return some of the patches, in their order."""
+        return Patches(self.seeds[some], self.index[some], self.owned[some], self.radii[some])
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> Patches:
         """Return the same patches for a cloud of which this one is xyz[rows]."""

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.low_noise import wiener_weighted
 from straightpcf.model.neighbourhoods import neighbourhoods
-from straightpcf.model.patches import Patches
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
 
@@ -21,7 +20,6 @@ __all__ = ["held_to_lines", "limited_to_noise", "restrained_step", "trusted_nois
 
 # In noise stds: moves up to the first are made whole, from the last on none is (docs/filter.md, "How far ...").
 _FULL_STEP_STDS, _NO_STEP_STDS = 3.0, 4.0
-_FLAT_PATCH_STDS = 1.3  # a patch is flat where its points lie so many of its noise stds from their plane, or nearer
 _MOST_TRUSTED_RATIO = 3.0  # of the noise of most points, what is believed of any flat patch
 _DOUBTED_RATIO = 1.2  # of the same; of what is not flat and reads more, less is believed the more it reads
 
@@ -67,19 +65,18 @@ def restrained_step(
 
 
 def trusted_noise_stds(
-    positions: npt.NDArray[np.float64], cut: Patches, noise: npt.NDArray[np.float64], noise_of_most: float
+    noise: npt.NDArray[np.float64], flat: npt.NDArray[np.bool_], noise_of_most: float
 ) -> npt.NDArray[np.float64]:
-    """Return the noise std that is believed of each patch of points (N, 3): (M,), in their unit.
+    """Return the noise std that is believed of each patch: (M,), in the unit of noise.
 
-    noise: (M,), read of each patch; noise_of_most: of most points. The network takes a pole, a wire or a leaf for
-    noise, and reads more of it there. So more than most have is believed only of a patch whose noise is all that keeps
-    it from being flat, as of the far wall in a depth camera's frame, and less than that of any other that reads far
-    more.
+    noise: (M,), read of each patch; flat: (M,), whether it is all that keeps the patch from being flat; noise_of_most:
+    of most points. The network takes a pole, a wire or a leaf for noise, and reads more of it there. So more than most
+    have is believed only of a patch that is flat, as of the far wall in a depth camera's frame, and less than that of
+    any other that reads far more.
     """
-    thickness = np.array([_thickness(positions[rows]) for rows in cut.index])
     doubt = np.minimum(1.0, _DOUBTED_RATIO * noise_of_most / np.maximum(noise, 1e-300))
     of_flat = np.clip(noise, noise_of_most, _MOST_TRUSTED_RATIO * noise_of_most)
-    return np.where(thickness < _FLAT_PATCH_STDS * noise, of_flat, noise_of_most * doubt)
+    return np.where(flat, of_flat, noise_of_most * doubt)
 
 
 def limited_to_noise(
@@ -133,9 +130,3 @@ def without_tangential_motion(step: npt.NDArray[np.float64], patch: npt.NDArray[
     along = step - (step * near.normals).sum(axis=1, keepdims=True) * near.normals
     out: npt.NDArray[np.float64] = step - along * plane[:, None]
     return out
-
-
-def _thickness(points: npt.NDArray[np.float64]) -> float:
-    """Return the rms distance of points (n, 3) from the plane that fits them best."""
-    local = points - points.mean(axis=0)
-    return float(np.sqrt(max(np.linalg.eigvalsh(local.T @ local)[0], 0.0) / len(points)))

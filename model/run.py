@@ -219,10 +219,14 @@ class Run:
         steps = [np.zeros_like(positions) for _ in reading.parts[1:]]  # all but the last, which is settled as it comes
         # The patches are cut from `positions`, so results may be written into self.moved as they come.
         for number, cut in self._cuts(positions, tiling, reading.parts):
-            scales = patch_scales(cut.radii, scene=reading.scene, zoom=self.reader.zooms(positions, cut, reading))
             known, trusted_noise = reading.known_distances, None
             if reading.scene and self.filter.zoom:
-                known, trusted_noise = self._trusted_noise(positions, cut, scales)
+                shown = self.reader.of_scene(positions, cut, raster=reading.raster)
+                scales, known = shown.scales, dict(enumerate(shown.distances.tolist()))
+                trusted_noise = trusted_noise_stds(shown.noise_stds, shown.flat, self.readings[0].noise_of_most)
+            else:
+                zoom = self.reader.zooms(positions, cut, reading)
+                scales = patch_scales(cut.radii, scene=reading.scene, zoom=zoom)
             finish = partial(self._restrained_step, positions, cut, scales, reading.sampling, trusted_noise)
             steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish)
             for owned, step, held_back in steps_made:
@@ -256,15 +260,6 @@ class Run:
         limit = None if trusted_noise is None else trusted_noise[patch]
         moved, around = self.moved[owned], positions[cut.index[patch]]
         return owned, *restrained_step(step, moved, around, sampling=sampling, trusted_noise=limit)
-
-    def _trusted_noise(
-        self, positions: npt.NDArray[np.float64], cut: Patches, scales: npt.NDArray[np.float64]
-    ) -> tuple[dict[int, float], npt.NDArray[np.float64]]:
-        """Return what the DistanceModule says of a scene's patches, by number, and the noise std believed of each."""
-        distances = self.filter.processor.distances(positions, cut, scales)
-        noise = self.reader.noise_stds(distances, scales)
-        trusted = trusted_noise_stds(positions, cut, noise, self.readings[0].noise_of_most)
-        return dict(enumerate(distances.tolist())), trusted
 
     def _cuts(
         self, positions: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]

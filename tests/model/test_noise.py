@@ -11,9 +11,9 @@ import pytest
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.noise import NoiseReader
-from straightpcf.model.normalize import HIGH_NOISE, CloudFrame
+from straightpcf.model.normalize import HIGH_NOISE, CloudFrame, patch_scales
 from straightpcf.model.tiles import Tiling
-from tests.clouds import torus
+from tests.clouds import far_group, noisy, sphere, torus
 
 _POINTS = 10_000
 
@@ -93,3 +93,39 @@ def test_noise_is_uneven_where_patches_differ_by_more_than_shape(
     if uneven:
         np.testing.assert_allclose((zooms * noise)[noise == loud], min(0.03, reading.zoom * loud))
         assert not reading.known_distances  # they were shown in another size
+
+
+def bent_and_flat() -> npt.NDArray[np.float64]:
+    """Return a flat field beside a ball, far from the origin's other side, as a scene: noise of 0.02 across each."""
+    rng = np.random.default_rng(0)
+    field = np.column_stack([rng.uniform(0, 4, 20_000), rng.uniform(-4, 4, 20_000), np.zeros(20_000)])
+    ball = 0.4 * sphere(4000) + [-3, 0, 0]
+    return noisy(np.concatenate([field, ball, far_group(60.0)]), 0.02)
+
+
+@pytest.mark.parametrize("raster", [False, True])
+def test_what_is_flat_in_a_scene_is_shown_smaller_and_so_is_a_raster(*, raster: bool) -> None:
+    xyz = bent_and_flat()
+    frame = CloudFrame.of(xyz)
+    positions, noise = frame.enter(xyz), 0.02 / frame.radius
+    reader = NoiseReader(Says(noise, noise), Calibration(), tile, zoom=True)  # type: ignore[arg-type]
+    (cut,) = tile(positions).cuts()
+    shown = reader.of_scene(positions, cut, raster=raster)
+    usual = 0.25 / cut.radii
+    field = (xyz[cut.seeds, 0] > 1) & (noise * usual > 0.005)
+    ball = np.linalg.norm(xyz[cut.seeds] + [3, 0, 0], axis=1) < 0.5
+    assert shown.flat[field].all()
+    assert not shown.flat[ball].any()
+    assert (shown.scales[field] < 0.9 * usual[field]).all()
+    assert ((shown.scales < 0.9 * usual)[ball] == raster).all()
+    np.testing.assert_allclose(shown.noise_stds, noise)  # whatever the size in which it was read
+    np.testing.assert_allclose(shown.distances, np.minimum(1, noise * shown.scales / 0.02))
+
+
+def test_without_zoom_a_scenes_patches_have_the_usual_size() -> None:
+    xyz = bent_and_flat()
+    positions = CloudFrame.of(xyz).enter(xyz)
+    reader = NoiseReader(Says(0.001, 0.001), Calibration(), tile, zoom=False)  # type: ignore[arg-type]
+    (cut,) = tile(positions).cuts()
+    shown = reader.of_scene(positions, cut, raster=False)
+    np.testing.assert_allclose(shown.scales, patch_scales(cut.radii, scene=True))

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from straightpcf.model.normalize import is_scene, parts_of, patch_scales, zoom_of, zoom_of_each, zoom_of_rest
+from straightpcf.model.normalize import (
+    is_scene,
+    parts_of,
+    patch_scales,
+    zoom_of,
+    zoom_of_each,
+    zoom_of_flat,
+    zoom_of_rest,
+)
 
 
 def test_an_objects_patches_keep_the_papers_frame() -> None:
@@ -45,6 +53,10 @@ def test_loud_patches_of_uneven_noise_are_shown_in_the_size_of_their_own() -> No
     np.testing.assert_allclose(zoom_of_each(np.array([0.0, 0.005, 0.02, 0.04]), 2.0), [2.0, 2.0, 1.5, 1.0])
     scales = patch_scales(np.array([0.2, 0.2, 0.5, 0.01]), scene=False, zoom=np.array([2.0, 1.5, 1.0, 2.0]))
     np.testing.assert_allclose(scales, [2.0, 1.5, 1.0, 10.0])
+
+
+def test_what_is_flat_is_shown_smaller_the_more_noise_it_has() -> None:
+    np.testing.assert_allclose(zoom_of_flat(np.array([0.0, 0.004, 0.005, 0.008, 0.1])), [1.0, 1.0, 0.8, 0.5, 0.4])
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.1, 1.0])

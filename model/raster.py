@@ -1,0 +1,41 @@
+"""Rasters: a height for every cell of a grid, as elevation models and height maps have them."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["is_raster"]
+
+Floats = npt.NDArray[np.float64]
+
+_SOME, _DISTINCT_SHARE = 2000, 0.9  # points that are looked at first, and distinct coordinates of these
+_POINTS_A_LINE = 4  # of a row or a column, at least, as a mean
+_OFF_GRID = 0.05  # cells: what rounding to float32 may do, and much less than a cell
+
+
+def is_raster(xyz: Floats) -> bool:
+    """Say whether points (N, 3) lie on a grid along two of the axes, one in a cell, and off any along the third."""
+    some = xyz[:: max(1, len(xyz) // _SOME)]
+    gridded = [axis for axis in range(3) if len(np.unique(some[:, axis])) < _DISTINCT_SHARE * len(some)]
+    for plane in combinations(gridded, 2):
+        if all(_POINTS_A_LINE * _lines(xyz, axis) > len(xyz) for axis in set(range(3)) - set(plane)):
+            cells = [found for axis in plane if (found := _cells(xyz[:, axis])) is not None]
+            if len(cells) == len(plane):
+                return len(np.unique(np.stack(cells), axis=1).T) == len(xyz)
+    return False
+
+
+def _lines(xyz: Floats, axis: int) -> int:
+    return len(np.unique(xyz[:, axis]))
+
+
+def _cells(coordinates: Floats) -> npt.NDArray[np.int64] | None:
+    """Return which cell of an even grid each of the coordinates (N,) is in, None where they lie on none: (N,)."""
+    lines = np.unique(coordinates)
+    if len(lines) < 2 or _POINTS_A_LINE * len(lines) > len(coordinates):
+        return None
+    cells = (coordinates - lines[0]) / np.median(np.diff(lines))
+    return np.round(cells).astype(np.int64) if np.abs(cells - np.round(cells)).max() < _OFF_GRID else None

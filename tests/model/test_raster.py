@@ -1,0 +1,63 @@
+"""Rasters: a height for every cell of a grid, with noise in the heights alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from straightpcf.model.filter import load_filter
+from straightpcf.model.raster import is_raster
+from tests.clouds import noisy, sphere
+
+
+def hills(side: int, *, noise_std: float = 0.0, edge: float = 1.0) -> npt.NDArray[np.float64]:
+    """Return heights over side x side cells, (N, 3)."""
+    x, y = (edge * grid.ravel() for grid in np.meshgrid(np.arange(side), np.arange(side)))
+    z = height(x / edge, y / edge) * edge
+    return np.column_stack([x, y, z + noise_std * np.random.default_rng(0).standard_normal(len(x))])
+
+
+def height(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return 3 * np.sin(x / 9) + 2 * np.cos(y / 11 + x / 20)
+
+
+def rms_off_the_hills(xyz: npt.NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean((xyz[:, 2] - height(*xyz[:, :2].T)) ** 2)))
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+@pytest.mark.parametrize("away", [0.0, 5000.0])
+def test_heights_over_a_grid_are_a_raster_whichever_axis_they_are_along(up: int, away: float) -> None:
+    cloud = np.roll(hills(50, noise_std=0.3, edge=0.5) + away, up - 2, axis=1)
+    assert is_raster(cloud)
+    assert is_raster(cloud.astype(np.float32).astype(np.float64))
+    assert is_raster(cloud[np.random.default_rng(1).random(len(cloud)) < 0.7])  # cells without a height
+
+
+def test_other_clouds_are_no_rasters() -> None:
+    cloud = hills(50, noise_std=0.3)
+    turned = cloud @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
+    assert not is_raster(turned)
+    assert not is_raster(noisy(cloud, 0.01))
+    assert not is_raster(np.concatenate([cloud, cloud + np.array([0, 0, 4])]))  # two heights in a cell
+    assert not is_raster(np.round(cloud))  # steps: voxels
+    assert not is_raster(hills(50) * [1, 1, 0])  # no heights at all
+    assert not is_raster(sphere(5000))
+    assert not is_raster(np.unique(np.round(sphere(5000), 2), axis=0))
+
+
+@pytest.mark.parametrize("noise_std", [0.2, 0.6])
+def test_a_rasters_noise_is_taken_away_and_its_cells_keep_their_places(noise_std: float) -> None:
+    cloud = hills(60, noise_std=noise_std)
+    result = load_filter(threads=2).denoise(cloud)
+    assert rms_off_the_hills(result.xyz) < 0.4 * rms_off_the_hills(cloud)
+    assert result.noise_before == pytest.approx(noise_std, rel=0.25)
+    beside = np.linalg.norm(result.xyz[:, :2] - cloud[:, :2], axis=1)
+    assert np.median(beside) < 0.1  # cells
+
+
+def test_a_raster_without_noise_stays_as_it_is() -> None:
+    cloud = hills(60)
+    result = load_filter(threads=2).denoise(cloud)
+    assert np.linalg.norm(result.xyz - cloud, axis=1).max() < 0.05
