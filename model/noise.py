@@ -41,7 +41,9 @@ _UNCOVERED_BELOW = 0.35
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
-_FLAT_PATCH_STDS = 1.3  # a patch is flat where its points lie so many of its noise stds from their plane, or nearer
+# A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
+# of how far they spread along it: the network sees noise in a tree, too.
+_FLAT_PATCH_STDS, _FLAT_RATIO = 1.3, 0.4
 
 
 @dataclass(frozen=True)
@@ -149,16 +151,17 @@ class NoiseReader:
         scales = patch_scales(cut.radii, scene=True)
         distances = usual = self._processor.distances(positions, cut, scales)
         noise = self.noise_stds(distances, scales)
-        thickness = np.array([_thickness(positions[rows]) for rows in cut.index])
+        thickness, width = np.array([_thickness(positions[rows]) for rows in cut.index]).T
+        thin = thickness < _FLAT_RATIO * width
         zoom = zoom_of_flat(noise * scales) if self._zoom else np.ones(len(scales))
         if (smaller := zoom < 1).any():
             zoomed = (zoom * scales)[smaller]
             read = self._processor.distances(positions, cut[smaller], zoomed)
             of_zoomed = self.noise_stds(read, zoomed)
-            shown = raster | (thickness[smaller] < _FLAT_PATCH_STDS * of_zoomed)
+            shown = raster | (thin[smaller] & (thickness[smaller] < _FLAT_PATCH_STDS * of_zoomed))
             rows, distances = np.flatnonzero(smaller)[shown], usual.copy()
             scales[rows], distances[rows], noise[rows] = zoomed[shown], read[shown], of_zoomed[shown]
-        return ScenePatches(usual, scales, distances, noise, thickness < _FLAT_PATCH_STDS * noise)
+        return ScenePatches(usual, scales, distances, noise, thin & (thickness < _FLAT_PATCH_STDS * noise))
 
     def zooms(self, positions: Floats, cut: Patches, reading: Reading) -> Floats | float:
         """Return the factor by which a pass shows its patches larger: of each, (M,), or of all."""
@@ -262,7 +265,8 @@ def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> flo
     return float(values[order][np.searchsorted(below, share * below[-1])])
 
 
-def _thickness(points: Floats) -> float:
-    """Return the rms distance of points (n, 3) from the plane that fits them best."""
+def _thickness(points: Floats) -> tuple[float, float]:
+    """Return the std of points (n, 3) across the plane that fits them best, and the lesser one along it."""
     local = points - points.mean(axis=0)
-    return float(np.sqrt(max(np.linalg.eigvalsh(local.T @ local)[0], 0.0) / len(points)))
+    across, along, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(local.T @ local), 0.0) / len(points))
+    return float(across), float(along)
