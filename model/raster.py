@@ -14,17 +14,21 @@ Floats = npt.NDArray[np.float64]
 _SOME, _DISTINCT_SHARE = 2000, 0.9  # points that are looked at first, and distinct coordinates of these
 _POINTS_A_LINE = 4  # of a row or a column, at least, as a mean
 _OFF_GRID = 0.05  # cells: what rounding to float32 may do, and much less than a cell
+_FILLED_SHARE = 0.25  # of the grid's cells; coordinates that are merely rounded fill hardly any
 
 
 def is_raster(xyz: Floats) -> bool:
     """Say whether points (N, 3) lie on a grid along two of the axes, one in a cell, and off any along the third."""
-    some = xyz[:: max(1, len(xyz) // _SOME)]
+    # At random: each n-th point of a grid may be all of one column.
+    some = xyz if len(xyz) <= _SOME else xyz[np.random.default_rng(0).integers(len(xyz), size=_SOME)]
     gridded = [axis for axis in range(3) if len(np.unique(some[:, axis])) < _DISTINCT_SHARE * len(some)]
     for plane in combinations(gridded, 2):
         if all(_POINTS_A_LINE * _lines(xyz, axis) > len(xyz) for axis in set(range(3)) - set(plane)):
-            cells = [found for axis in plane if (found := _cells(xyz[:, axis])) is not None]
-            if len(cells) == len(plane):
-                return len(np.unique(np.stack(cells), axis=1).T) == len(xyz)
+            first, second = (_cells(xyz[:, axis]) for axis in plane)
+            if first is not None and second is not None:
+                rows, columns = int(first.max()) + 1, int(second.max()) + 1
+                filled = len(xyz) > _FILLED_SHARE * rows * columns
+                return filled and len(np.unique(first * columns + second)) == len(xyz)
     return False
 
 

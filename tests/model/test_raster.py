@@ -35,6 +35,11 @@ def test_heights_over_a_grid_are_a_raster_whichever_axis_they_are_along(up: int,
     assert is_raster(cloud[np.random.default_rng(1).random(len(cloud)) < 0.7])  # cells without a height
 
 
+@pytest.mark.parametrize("side", [45, 100, 200, 201, 1000])
+def test_a_raster_is_one_however_large(side: int) -> None:
+    assert is_raster(hills(side))
+
+
 def test_other_clouds_are_no_rasters() -> None:
     cloud = hills(50, noise_std=0.3)
     turned = cloud @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
@@ -43,6 +48,8 @@ def test_other_clouds_are_no_rasters() -> None:
     assert not is_raster(np.concatenate([cloud, cloud + np.array([0, 0, 4])]))  # two heights in a cell
     assert not is_raster(np.round(cloud))  # steps: voxels
     assert not is_raster(hills(50) * [1, 1, 0])  # no heights at all
+    x, y = np.unique(np.round(np.random.default_rng(0).uniform(0, 40, (3000, 2)), 1), axis=0).T
+    assert not is_raster(np.column_stack([x, y, height(x, y)]))  # a grid, and nearly all of it empty
     assert not is_raster(sphere(5000))
     assert not is_raster(np.unique(np.round(sphere(5000), 2), axis=0))
 
