@@ -22,7 +22,7 @@ from straightpcf.model.normalize import (
 )
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats, Processor
-from straightpcf.model.raster import is_raster
+from straightpcf.model.raster import height_axis
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling
 
@@ -56,8 +56,8 @@ class Reading:
     patches, before the first pass (a scene's are shown in sizes of their own, and d says as much); known_distances:
     what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
     scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
-    uneven: whether that pass shows no patch larger than the noise in it asks for; raster: whether the cloud is a height
-    for every cell of a grid.
+    uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
+    raster, None of any other cloud.
     """
 
     distance: float
@@ -71,7 +71,7 @@ class Reading:
     noise_of_most: float = 0.0
     high_noise: bool = False
     uneven: bool = False
-    raster: bool = False
+    height_axis: int | None = None
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,13 @@ class NoiseReader:
         size than that of the reading, d is read in that size, too.
         """
         probes, numbers = tiling.probes()
-        raster = is_raster(positions) if first is None else first.raster
-        scene = raster or is_scene(_quantile(probes.radii, probes.owned, 0.5)) if first is None else first.scene
+        if first is None:
+            axis = height_axis(positions)
+            scene = axis is not None or is_scene(_quantile(probes.radii, probes.owned, 0.5))
+        else:
+            axis, scene = first.height_axis, first.scene
         if scene:
-            return self._read_scene(positions, tiling, probes, raster=raster, first=first is None)
+            return self._read_scene(positions, tiling, probes, axis, first=first is None)
         scales = patch_scales(probes.radii, scene=False)
         distances = self._processor.distances(positions, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
@@ -186,8 +189,11 @@ class NoiseReader:
             noise, most, enough = again, self._largest_noise / zoom, _REREAD_ABOVE
         return noise
 
-    def _read_scene(self, positions: Floats, tiling: Tiling, probes: Patches, *, raster: bool, first: bool) -> Reading:
+    def _read_scene(
+        self, positions: Floats, tiling: Tiling, probes: Patches, axis: int | None, *, first: bool
+    ) -> Reading:
         """Read the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
+        raster = axis is not None
         shown = self.of_scene(positions, probes, raster=raster)
         parts: tuple[int, ...] = (1,)
         noise, noise_of_most = self._noise_of_scene(shown, probes)
@@ -196,7 +202,7 @@ class NoiseReader:
             parts = parts_of(noise, probes.radii, len(positions))
         distance = float(np.median(shown.usual_distances))
         sampling = Sampling(irregular=True)
-        return Reading(distance, noise, True, sampling, parts=parts, noise_of_most=noise_of_most, raster=raster)
+        return Reading(distance, noise, True, sampling, parts=parts, noise_of_most=noise_of_most, height_axis=axis)
 
     def _noise_of_scene(self, shown: ScenePatches, probes: Patches) -> tuple[float, float]:
         """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["is_raster"]
+__all__ = ["height_axis"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -17,23 +17,24 @@ _OFF_GRID = 0.05  # cells: what rounding to float32 may do, and much less than a
 _FILLED_SHARE = 0.25  # of the grid's cells; coordinates that are merely rounded fill hardly any
 
 
-def is_raster(xyz: Floats) -> bool:
-    """Say whether points (N, 3) lie on a grid along two of the axes, one in a cell, and off any along the third."""
+def height_axis(xyz: Floats) -> int | None:
+    """Return the axis of the heights of points (N, 3) that are a raster, None where they are none.
+
+    On a grid along the two other axes, one in a cell, and off any along this.
+    """
     # At random: each n-th point of a grid may be all of one column.
     some = xyz if len(xyz) <= _SOME else xyz[np.random.default_rng(0).integers(len(xyz), size=_SOME)]
     gridded = [axis for axis in range(3) if len(np.unique(some[:, axis])) < _DISTINCT_SHARE * len(some)]
     for plane in combinations(gridded, 2):
-        if all(_POINTS_A_LINE * _lines(xyz, axis) > len(xyz) for axis in set(range(3)) - set(plane)):
-            first, second = (_cells(xyz[:, axis]) for axis in plane)
-            if first is not None and second is not None:
-                rows, columns = int(first.max()) + 1, int(second.max()) + 1
-                filled = len(xyz) > _FILLED_SHARE * rows * columns
-                return filled and len(np.unique(first * columns + second)) == len(xyz)
-    return False
-
-
-def _lines(xyz: Floats, axis: int) -> int:
-    return len(np.unique(xyz[:, axis]))
+        (up,) = set(range(3)) - set(plane)
+        if _POINTS_A_LINE * len(np.unique(xyz[:, up])) <= len(xyz):
+            continue
+        first, second = (_cells(xyz[:, axis]) for axis in plane)
+        if first is not None and second is not None:
+            rows, columns = int(first.max()) + 1, int(second.max()) + 1
+            filled = len(xyz) > _FILLED_SHARE * rows * columns
+            return up if filled and len(np.unique(first * columns + second)) == len(xyz) else None
+    return None
 
 
 def _cells(coordinates: Floats) -> npt.NDArray[np.int64] | None:

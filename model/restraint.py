@@ -16,7 +16,14 @@ from straightpcf.model.neighbourhoods import neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
 
-__all__ = ["held_to_lines", "limited_to_noise", "restrained_step", "trusted_noise_stds", "without_tangential_motion"]
+__all__ = [
+    "along_heights",
+    "held_to_lines",
+    "limited_to_noise",
+    "restrained_step",
+    "trusted_noise_stds",
+    "without_tangential_motion",
+]
 
 # In noise stds: moves up to the first are made whole, from the last on none is (docs/filter.md, "How far ...").
 _FULL_STEP_STDS, _NO_STEP_STDS = 3.0, 4.0
@@ -30,6 +37,7 @@ _HELD_BACK_SHARE = 0.5  # of a step; where less is left between walls, that is s
 # stds along the plane are as 1 : 10 or less; from 1 : 5 on it is none.
 _PLANE_NEIGHBOURS = 24
 _PLANE_RATIO, _VOLUME_RATIO, _LINE_RATIO = 0.15, 0.3, 0.1
+_STEEP = 0.5  # of a raster: where the normal has less along the heights, these are not read off the step across
 # So many neighbours lie in a line where the greater of their stds across it is a tenth of that along it, and in none
 # from a fifth on. A mean and the line's direction take three of them (degrees of freedom).
 _LINE_NEIGHBOURS, _IN_LINE_RATIO, _OFF_LINE_RATIO, _LINE_FREEDOM = 8, 0.1, 0.2, 3
@@ -113,6 +121,21 @@ def held_to_lines(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64])
     moves = np.square(off).sum(axis=1)[beside].mean(axis=1)
     kept = in_line * (1 - np.minimum(1.0, noise / np.maximum(moves, 1e-300)))
     out: npt.NDArray[np.float64] = step - off * kept[:, None]
+    return out
+
+
+def along_heights(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64], axis: int) -> npt.NDArray[np.float64]:
+    """Return steps (n, 3) along an axis alone, to where those that are asked for would take the surface.
+
+    patch: (P, 3) points of a raster, of which the first n make the step; axis: that of their heights. Where the surface
+    is steep, what the step has along the axis.
+    """
+    near = neighbourhoods(patch[: len(step)], patch, _PLANE_NEIGHBOURS)
+    upright = near.normals[:, axis]
+    steep = np.abs(upright) < _STEEP
+    height = np.where(steep, step[:, axis], (step * near.normals).sum(axis=1) / np.where(steep, 1.0, upright))
+    out = np.zeros_like(step)
+    out[:, axis] = height
     return out
 
 

@@ -15,8 +15,7 @@ from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, far_out, isolated
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import restrained_step, trusted_noise_stds
-from straightpcf.model.spacing import Sampling
+from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
 from straightpcf.points.cloud import as_positions
@@ -221,13 +220,13 @@ class Run:
         for number, cut in self._cuts(positions, tiling, reading.parts):
             known, trusted_noise = reading.known_distances, None
             if reading.scene and self.filter.zoom:
-                shown = self.reader.of_scene(positions, cut, raster=reading.raster)
+                shown = self.reader.of_scene(positions, cut, raster=reading.height_axis is not None)
                 scales, known = shown.scales, dict(enumerate(shown.distances.tolist()))
                 trusted_noise = trusted_noise_stds(shown.noise_stds, shown.flat, self.readings[0].noise_of_most)
             else:
                 zoom = self.reader.zooms(positions, cut, reading)
                 scales = patch_scales(cut.radii, scene=reading.scene, zoom=zoom)
-            finish = partial(self._restrained_step, positions, cut, scales, reading.sampling, trusted_noise)
+            finish = partial(self._restrained_step, positions, cut, scales, reading, trusted_noise)
             steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish)
             for owned, step, held_back in steps_made:
                 self.held_back[owned] |= held_back
@@ -248,7 +247,7 @@ class Run:
         positions: npt.NDArray[np.float64],
         cut: Patches,
         scales: npt.NDArray[np.float64],
-        sampling: Sampling,
+        reading: Reading,
         trusted_noise: npt.NDArray[np.float64] | None,
         patch: int,
         displacement: npt.NDArray[np.float64],
@@ -259,7 +258,10 @@ class Run:
             return owned, step, False
         limit = None if trusted_noise is None else trusted_noise[patch]
         moved, around = self.moved[owned], positions[cut.index[patch]]
-        return owned, *restrained_step(step, moved, around, sampling=sampling, trusted_noise=limit)
+        step, held_back = restrained_step(step, moved, around, sampling=reading.sampling, trusted_noise=limit)
+        if reading.height_axis is not None:
+            step = along_heights(step, around, reading.height_axis)
+        return owned, step, held_back
 
     def _cuts(
         self, positions: npt.NDArray[np.float64], tiling: Tiling, parts: tuple[int, ...]

@@ -8,7 +8,13 @@ import pytest
 from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import held_to_lines, limited_to_noise, trusted_noise_stds, without_tangential_motion
+from straightpcf.model.restraint import (
+    along_heights,
+    held_to_lines,
+    limited_to_noise,
+    trusted_noise_stds,
+    without_tangential_motion,
+)
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
@@ -79,6 +85,16 @@ def test_a_line_of_points_goes_off_it_no_farther_than_it_scatters() -> None:
     back = -wire * [0, 1, 1]
     denoised = held_to_lines(back, np.concatenate([wire, wall]))
     assert np.linalg.norm(denoised) > 0.9 * np.linalg.norm(back)
+
+
+def test_a_rasters_step_across_a_slope_becomes_one_of_its_heights() -> None:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(20.0), np.arange(20.0)))
+    slope = np.column_stack([x, y, 0.5 * x])
+    across = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    step = along_heights(np.array([0.2 * across, [1.0, 0, 0.5], [0, 0, 0.3]]), slope, 2)
+    np.testing.assert_allclose(step, [[0, 0, 0.2 * np.sqrt(1.25)], [0, 0, 0], [0, 0, 0.3]], atol=1e-9)
+    cliff = slope * [0.1, 1, 10]
+    np.testing.assert_allclose(along_heights(np.array([[0.3, 0, 0.1]]), cliff, 2), [[0, 0, 0.1]])
 
 
 def test_what_is_no_line_is_not_held_to_one() -> None:
