@@ -108,7 +108,7 @@ class NoiseReader:
         """
         probes, numbers = tiling.probes()
         if first is None:
-            axis = height_axis(positions)
+            axis = height_axis(positions) if self._zoom else None
             scene = axis is not None or is_scene(_quantile(probes.radii, probes.owned, 0.5))
         else:
             axis, scene = first.height_axis, first.scene

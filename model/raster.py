@@ -7,13 +7,14 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.grid import cells_of
+
 __all__ = ["height_axis"]
 
 Floats = npt.NDArray[np.float64]
 
 _SOME, _DISTINCT_SHARE = 2000, 0.9  # points that are looked at first, and distinct coordinates of these
 _POINTS_A_LINE = 4  # of a row or a column, at least, as a mean
-_OFF_GRID = 0.05  # cells: what rounding to float32 may do, and much less than a cell
 _FILLED_SHARE = 0.25  # of the grid's cells; coordinates that are merely rounded fill hardly any
 
 
@@ -42,5 +43,4 @@ def _cells(coordinates: Floats) -> npt.NDArray[np.int64] | None:
     lines = np.unique(coordinates)
     if len(lines) < 2 or _POINTS_A_LINE * len(lines) > len(coordinates):
         return None
-    cells = (coordinates - lines[0]) / np.median(np.diff(lines))
-    return np.round(cells).astype(np.int64) if np.abs(cells - np.round(cells)).max() < _OFF_GRID else None
+    return cells_of(coordinates, lines[0], float(np.median(np.diff(lines))))

@@ -6,12 +6,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from straightpcf.model.grid import OFF_GRID, cells_of
+
 __all__ = ["are_steps", "edge_of_voxels", "within_voxels"]
 
 Floats = npt.NDArray[np.float64]
 
 _BESIDE = 4  # of a surface's voxels half have as many face to face, whatever its slope
-_OFF_GRID = 0.05  # cells: what rounding to float32 may do, and much less than a cell
 _FEWEST_A_LAYER = 4  # points that share a coordinate, at least, as the mean of an axis
 _SOME = 2000  # points whose neighbours are looked up
 # Noise read beside a cell: 0.21 to 0.38 of what bends, 0.02 to 0.15 of what is flat along the axes, and exact.
@@ -28,10 +29,9 @@ def edge_of_voxels(xyz: Floats) -> float:
     some = xyz[:: max(1, len(xyz) // _SOME)]
     distances, _ = cKDTree(xyz).query(some, k=[2, _BESIDE + 1])
     edge, beside = np.median(distances, axis=0)
-    if edge <= 0.0 or beside > (1 + _OFF_GRID) * edge:
+    if edge <= 0.0 or beside > (1 + OFF_GRID) * edge:
         return 0.0
-    cells = (xyz - xyz[0]) / edge
-    return float(edge) if np.abs(cells - np.round(cells)).max() < _OFF_GRID else 0.0
+    return 0.0 if cells_of(xyz, xyz[0], edge) is None else float(edge)
 
 
 def are_steps(edge: float, noise_std: float) -> bool:

@@ -38,11 +38,16 @@ router = APIRouter(tags=["jobs"])
 Owner = Annotated[str, Depends(owner_of)]
 
 
+def shown(request: Request, record: JobRecord) -> Job:
+    """Render a job, its links as who asks finds them."""
+    return Job.of(record, root=request.scope["root_path"])
+
+
 def job_response(
     request: Request, record: JobRecord, status: int, headers: dict[str, str] | None = None
 ) -> JSONResponse:
     """Show a job, with the place where it is."""
-    job = Job.of(record, root=request.scope["root_path"])
+    job = shown(request, record)
     return JSONResponse(job.plain(), status_code=status, headers={"Location": job.links.self, **(headers or {})})
 
 
@@ -81,8 +86,7 @@ async def list_jobs(
     """Show this key's jobs, newest first."""
     engine: Engine = request.app.state.engine
     records, next_cursor = await engine.list(owner=owner, states=state or (), limit=limit, cursor=cursor)
-    root = request.scope["root_path"]
-    return JobPage(jobs=[Job.of(record, root=root) for record in records], next_cursor=next_cursor)
+    return JobPage(jobs=[shown(request, record) for record in records], next_cursor=next_cursor)
 
 
 @router.head("/jobs/{id}", include_in_schema=False)
@@ -95,7 +99,7 @@ async def get_job(
 ) -> Job:
     """Show a job, as soon as it is finished or the wait is over."""
     engine: Engine = request.app.state.engine
-    return Job.of(await engine.wait(id, owner=owner, seconds=wait), root=request.scope["root_path"])
+    return shown(request, await engine.wait(id, owner=owner, seconds=wait))
 
 
 @router.get(

@@ -15,7 +15,7 @@ from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import open_result, report_and_file, result_response
 from straightpcf.service.api.events import SSE_MEDIA_TYPE, event_stream
 from straightpcf.service.api.intake import flag, take_job
-from straightpcf.service.api.jobs import job_response
+from straightpcf.service.api.jobs import job_response, shown
 from straightpcf.service.api.negotiate import asks_for
 from straightpcf.service.api.openapi import (
     DENOISE_BODY,
@@ -27,7 +27,7 @@ from straightpcf.service.api.openapi import (
     problems,
 )
 from straightpcf.service.api.prefer import parse_prefer
-from straightpcf.service.api.schemas import Health, Info, Job
+from straightpcf.service.api.schemas import Health, Info
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord
 
@@ -69,10 +69,8 @@ async def denoise(request: Request, owner: Owner) -> Response:
     prefer = parse_prefer(request.headers.getlist("prefer"))
     record, _, fields = await take_job(request, owner, endpoint="denoise", more_fields=frozenset({"report"}))
     if asks_for(",".join(request.headers.getlist("accept")), SSE_MEDIA_TYPE):
-        root = request.scope["root_path"]
-        return event_stream(
-            engine, record.id, owner, root=root, headers={"Location": Job.of(record, root=root).links.self}
-        )
+        at = {"Location": shown(request, record).links.self}
+        return event_stream(engine, record.id, owner, root=request.scope["root_path"], headers=at)
     if prefer.respond_async and prefer.wait is None:
         return job_response(request, record, 202, prefer.applied(finished=False))
     # Nobody else knows the id of such a job: it lives as long as its request.

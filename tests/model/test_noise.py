@@ -129,3 +129,13 @@ def test_without_zoom_a_scenes_patches_have_the_usual_size() -> None:
     (cut,) = tile(positions).cuts()
     shown = reader.of_scene(positions, cut, raster=False)
     np.testing.assert_allclose(shown.scales, patch_scales(cut.radii, scene=True))
+
+
+@pytest.mark.parametrize("zoom", [True, False])
+def test_without_zoom_a_raster_is_an_object_as_in_the_paper(*, zoom: bool) -> None:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(50.0), np.arange(50.0)))
+    xyz = np.column_stack([x, y, np.sin(x / 5) + np.cos(y / 7)])
+    positions = CloudFrame.of(xyz).enter(xyz)
+    reader = NoiseReader(Says(0.001, 0.001), Calibration(), tile, zoom=zoom)  # type: ignore[arg-type]
+    reading = reader.read(positions, tile(positions), None)
+    assert (reading.height_axis, reading.scene) == ((2, True) if zoom else (None, False))
