@@ -32,7 +32,7 @@ from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Job, JobPage, Repo
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord, JobState
 
-__all__ = ["job_response", "router"]
+__all__ = ["job_response", "router", "shown"]
 
 router = APIRouter(tags=["jobs"])
 Owner = Annotated[str, Depends(owner_of)]
