@@ -160,6 +160,7 @@ def _ours(options: argparse.Namespace) -> Filter:
     model.coverage = options.coverage or model.coverage
     if options.every_evaluation:
         model.full_evaluations = model.euler_steps * len(model.network.velocity_modules)
+        model.agree = False
     if options.without_distance:
         _without_distance(model.network)
         model.zoom = False  # d tells no noise

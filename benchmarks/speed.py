@@ -108,10 +108,11 @@ class _Counting:
         self.distances, self.spread, self.mapper = processor.distances, processor.spread, processor.mapper
 
     def displacements(
-        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
-    ) -> Iterator[_T]:
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
+        *, agree: bool,
+    ) -> Iterator[_T | None]:  # fmt: skip
         self.done += [(cut.index.shape[1], int(some)) for some in cut.owned]
-        return self._processor.displacements(positions, cut, scales, known_distances, finish)
+        return self._processor.displacements(positions, cut, scales, known_distances, finish, agree=agree)
 
 
 def _reference(noisy: npt.NDArray[np.float64], options: argparse.Namespace) -> Timing:

@@ -17,7 +17,7 @@ from straightpcf.model.cpus import usable_cpus
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
-from straightpcf.model.processor import Processor
+from straightpcf.model.processor import First, Processor
 from straightpcf.model.run import MIN_POINTS, DenoiseResult, FinishedPatch, Run
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions
@@ -93,12 +93,14 @@ class Filter:
         coverage: float = COVERAGE,
         euler_steps: int = EULER_STEPS,
         full_evaluations: int = FULL_EVALUATIONS,
+        agree: bool = True,
         even: bool = True,
         zoom: bool = True,
         tile_points: int | None = None,
     ) -> None:
         """Put a network between the stages.
 
+        agree: what overlapping patches say of a point first is joined (`Agreement`).
         even: between passes, points are spread along the surface (`spread`). zoom: passes show an object in the size of
         its noise, and in parts where that fills the patches (`NoiseReader`), and less than what the network asks for is
         made of steps that are more than the noise (`restraint`).
@@ -120,20 +122,28 @@ class Filter:
         self.coverage = coverage
         self.euler_steps = euler_steps
         self.full_evaluations = full_evaluations
+        self.agree = agree
         self.even = even
         self.zoom = zoom
         self.turns = turns(_TURNS).to(device)
         self.processor: Processor
         if device == "cpu":
-            self.processor = OnHost(self.forward, self.distance, self.threads)
+            self.processor = OnHost(self, self.threads)
         else:
-            self.processor = OnDevice(self.forward, self.distance, device, threads=self.threads)
+            self.processor = OnDevice(self, device, threads=self.threads)
         keep_large_buffers()
 
-    def forward(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
+    def begin(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the velocities (B, P, 3) of a pass's first evaluation of patches (B, P, 3) float32."""
+        return self.network.first_velocities(x, self.turns)
+
+    def forward(
+        self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, first: First | None, rows: int
+    ) -> torch.Tensor:
         """Return how far the first `rows` points of patches (B, P, 3) float32 move in a pass, (B, rows, 3).
 
-        owned: (B,), of how many only that is asked; distance: (B, 1), where the DistanceModule has been asked before.
+        owned: (B,), of how many only that is asked; distance: (B, 1), where the DistanceModule has been asked before;
+        first: the velocities of the first evaluation, where that was made, and what takes their place.
         """
         moved: torch.Tensor = self.network(
             x,
@@ -143,6 +153,7 @@ class Filter:
             full_evaluations=self.full_evaluations,
             distance=distance,
             turns=self.turns,
+            first=first,
         )[0]
         return moved - x[:, :rows]
 

@@ -20,10 +20,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.agreement import Agreement
 from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
-from straightpcf.model.processor import Finish, Floats, Forward, Mapper, cut_out
+from straightpcf.model.processor import Finish, Floats, Mapper, Network, cut_out
 from straightpcf.model.spread import TANGENT_NEIGHBOURS, spread_among
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
@@ -34,6 +35,8 @@ _T = TypeVar("_T")
 # A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
 Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
 
+Compute = Callable[..., torch.Tensor]  # of a count of rows and tensors, of patches in each row
+_Key = tuple[int, int, int]  # patches, rows, tensors
 _BATCH = 32
 _ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
 _MOST_GRAPHS = 16
@@ -62,42 +65,41 @@ def _capture_stream(device: int) -> torch.cuda.Stream:
 
 
 class Graphs:
-    """A Forward replayed as a graph from the second time on that a shape of full patches comes.
+    """A computation on patches replayed as a graph from the second time on that a shape of full patches comes.
 
     A velocity evaluation is some forty kernels of a few microseconds; launching each takes the host as long. The first
     call of a shape compiles and sets up what a capture must not; where capturing fails, all goes on without graphs.
     """
 
-    def __init__(self, forward: Forward, capture: Capture) -> None:
-        self._forward, self._capture = forward, capture
-        self._seen: set[tuple[int, int, bool]] = set()
-        self._graphs: dict[
-            tuple[int, int, bool], tuple[list[torch.Tensor], Callable[[], object], torch.Tensor]
-        ] = {}  # fmt: skip
+    def __init__(self, compute: Compute, capture: Capture) -> None:
+        self._compute, self._capture = compute, capture
+        self._seen: set[_Key] = set()
+        self._graphs: dict[_Key, tuple[list[torch.Tensor], Callable[[], object], torch.Tensor]] = {}
         self._broken = False
 
-    def __call__(self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
-        """Do what the Forward does; the next call may overwrite the result, of at least `rows` rows."""
-        rows = min(x.shape[1], _ROWS * math.ceil(rows / _ROWS))
-        key = (len(x), rows, distance is not None)
-        given = [x, owned] if distance is None else [x, owned, distance]
+    def __call__(self, rows: int, *given: torch.Tensor) -> torch.Tensor:
+        """Compute for the first `rows` points of patches given[0] (B, P, 3), or some more.
+
+        The next call may overwrite the result.
+        """
+        rows = min(given[0].shape[1], _ROWS * math.ceil(rows / _ROWS))
+        key = (len(given[0]), rows, len(given))
         if key not in self._graphs:
-            worth = x.shape[1] == PATCH_SIZE and not self._broken
+            worth = given[0].shape[1] == PATCH_SIZE and not self._broken
             if not worth or key not in self._seen:
                 self._seen.add(key)
-                return self._forward(x, owned, distance, rows)
+                return self._compute(rows, *given)
             if len(self._graphs) == _MOST_GRAPHS:
                 del self._graphs[next(iter(self._graphs))]
             inputs = [tensor.clone() for tensor in given]
-            again = partial(self._forward, inputs[0], inputs[1], None if distance is None else inputs[2], rows)
             try:
-                self._graphs[key] = (inputs, *self._capture(again))
+                self._graphs[key] = (inputs, *self._capture(partial(self._compute, rows, *inputs)))
             except torch.OutOfMemoryError:
                 raise
             except RuntimeError as exc:
                 warnings.warn(f"the network is not captured as a CUDA graph, it runs without: {exc}", stacklevel=2)
                 self._broken = True
-                return self._forward(x, owned, distance, rows)
+                return self._compute(rows, *given)
         inputs, replay, out = self._graphs[key] = self._graphs.pop(key)  # the one used last is given up last
         for static, fresh in zip(inputs, given, strict=True):
             static.copy_(fresh)
@@ -114,35 +116,42 @@ class OnDevice:
 
     def __init__(
         self,
-        forward: Forward,
-        distances: Callable[[torch.Tensor], torch.Tensor],
+        network: Network,
         device: str,
         *,
         threads: int = 1,
         batch: int = _BATCH,
         capture: Capture = capture_cuda_graph,
     ) -> None:
-        """Take the network's two parts; batch: patches at once, halved when memory runs out; threads: of the CPU."""
-        self.device, self.batch = torch.device(device), batch
-        self._distances, self._graphs = distances, Graphs(forward, capture)
+        """Take the network; batch: patches at once, halved when memory runs out; threads: of the CPU."""
+        self.device, self.batch, self._network = torch.device(device), batch, network
+        self._begins = Graphs(self._begin, capture)
+        self._moves = Graphs(self._move, capture)
         self._pool = ThreadPoolExecutor(threads)
         self.mapper: Mapper = self._pool.map
 
     def displacements(
-        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
-    ) -> Iterator[_T]:
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
+        *, agree: bool,
+    ) -> Iterator[_T | None]:  # fmt: skip
         """Do what a Processor does; while the device computes a batch, the results of the one before are read.
 
         Raises TooLarge where it has no memory for one patch.
         """
         points, sent = self._sent(positions, cut, scales, known_distances)
+        heard: _Heard | None = None
+        if agree:
+            with current(self.device), enough_memory(self.device, len(positions)):
+                heard = _Heard(sent)
+            for some in self._batched(cut, partial(self._hear, points, sent, heard)):
+                yield from [None] * some
         waiting: deque[tuple[range, _Result]] = deque()
         first = 0
         while first < len(cut.seeds):
             chosen = range(first, min(first + self.batch, len(cut.seeds)))
             try:
                 with current(self.device):
-                    moves = self._launch(points, cut, sent, chosen)
+                    moves = self._launch(points, cut, sent, chosen, heard)
                     waiting.append((chosen, _Result(moves[: len(chosen)])))
             except torch.OutOfMemoryError as exc:
                 self._halve(cut, exc)
@@ -158,7 +167,7 @@ class OnDevice:
         """Return what the DistanceModule says of each patch: (M,). Raises TooLarge as `displacements` does."""
         points, sent = self._sent(positions, cut, scales, {})
         with current(self.device):
-            found = list(self._batched(cut, lambda batch: self._distances(sent.cut_out(points, batch))))
+            found = list(self._batched(cut, lambda batch: self._network.distance(sent.cut_out(points, batch))))
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
 
@@ -202,7 +211,8 @@ class OnDevice:
         if self.batch == 1:
             raise TooLarge(f"{self.device} has no memory for a patch of {cut.index.shape[1]} points") from exc
         self.batch //= 2
-        self._graphs.clear()
+        self._begins.clear()
+        self._moves.clear()
         torch.cuda.empty_cache()
 
     def _finished(self, batch: range, result: _Result, cut: Patches, finish: Finish[_T]) -> Iterator[_T]:
@@ -211,14 +221,38 @@ class OnDevice:
         yield from self._pool.map(finish, batch, owned)
 
     @torch.inference_mode()
-    def _launch(self, points: torch.Tensor, cut: Patches, sent: _DeviceCut, chosen: range) -> torch.Tensor:
+    def _hear(self, points: torch.Tensor, sent: _DeviceCut, heard: _Heard, some: slice) -> int:
+        """Have the first evaluation of some patches made, and return how many they are."""
+        chosen = range(len(sent.seeds))[some]
+        batch = self._filled(sent, chosen)
+        x = sent.cut_out(points, batch)
+        said = self._begins(x.shape[1], x, *sent.known_of(chosen, batch))[: len(chosen)]
+        heard.add(slice(chosen.start, chosen.stop), x[: len(chosen)], said)
+        return len(chosen)
+
+    def _begin(self, rows: int, x: torch.Tensor, *known: torch.Tensor) -> torch.Tensor:
+        """Return the first evaluation's velocities and, as one more point, three times d: (B, P + 1, 3)."""
+        distance = known[0] if known else self._network.distance(x)
+        return torch.cat([self._network.begin(x), distance[:, :, None].expand(-1, -1, 3)], dim=1)
+
+    def _move(self, rows: int, x: torch.Tensor, owned: torch.Tensor, *known: torch.Tensor) -> torch.Tensor:
+        """Return how far points move; known: d, and the first evaluation's velocities and what takes their place."""
+        first = (known[1], known[2]) if len(known) > 1 else None
+        return self._network.forward(x, owned, known[0] if known else None, first, rows)
+
+    @torch.inference_mode()
+    def _launch(
+        self, points: torch.Tensor, cut: Patches, sent: _DeviceCut, chosen: range, heard: _Heard | None
+    ) -> torch.Tensor:
+        batch = self._filled(sent, chosen)
+        known = sent.known_of(chosen, batch) if heard is None else heard.of_patches(batch)
+        rows = max(1, int(cut.owned[chosen.start : chosen.stop].max()))
+        return self._moves(rows, sent.cut_out(points, batch), sent.owned[batch], *known)
+
+    def _filled(self, sent: _DeviceCut, chosen: range) -> torch.Tensor:
         # A last batch that is not full is filled up with its last patch: one shape more would be one graph more.
-        full = self.batch if len(cut.seeds) > self.batch else len(chosen)
-        batch = torch.arange(chosen.start, chosen.start + full, device=self.device).clamp(max=chosen.stop - 1)
-        some = slice(chosen.start, chosen.stop)
-        distance = sent.known_distances[batch] if sent.known[some].all() else None
-        rows = max(1, int(cut.owned[some].max()))
-        return self._graphs(sent.cut_out(points, batch), sent.owned[batch], distance, rows)
+        full = self.batch if len(sent.seeds) > self.batch else len(chosen)
+        return torch.arange(chosen.start, chosen.start + full, device=self.device).clamp(max=chosen.stop - 1)
 
 
 @dataclass(frozen=True)
@@ -226,25 +260,53 @@ class _DeviceCut:
     """A cut and what goes with it, on the device: sent up once, for every batch of it.
 
     known: (M,), on the host, of which patches `known_distances`, (M, 1), holds what the DistanceModule said; index:
-    (M, P), seeds, owned: (M,), as in Patches; scales: (M,).
+    (M, P), seeds, owned, radii: (M,), as in Patches; scales: (M,).
     """
 
     known: npt.NDArray[np.bool_]
     index: torch.Tensor
     seeds: torch.Tensor
     owned: torch.Tensor
+    radii: torch.Tensor
     scales: torch.Tensor
     known_distances: torch.Tensor
 
     @classmethod
     def of(cls, cut: Patches, scales: Floats, known_distances: Mapping[int, float], device: torch.device) -> _DeviceCut:
         said = np.array([[known_distances.get(patch, np.nan)] for patch in range(len(cut.seeds))], dtype=np.float32)
-        parts = (torch.from_numpy(part).to(device) for part in (cut.index, cut.seeds, cut.owned, scales, said))
+        parts = (
+            torch.from_numpy(part).to(device) for part in (cut.index, cut.seeds, cut.owned, cut.radii, scales, said)
+        )
         return cls(~np.isnan(said[:, 0]), *parts)
 
     def cut_out(self, points: torch.Tensor, batch: torch.Tensor | slice) -> torch.Tensor:
         """Cut some patches out of the points."""
         return cut_out(points, self.index[batch], self.seeds[batch], self.scales[batch])
+
+    def known_of(self, chosen: range, batch: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the distances of the patches `batch`, where those of all that are chosen are known."""
+        return (self.known_distances[batch],) if self.known[chosen.start : chosen.stop].all() else ()
+
+
+class _Heard:
+    """What the patches of a cut said in their first evaluation, on the device."""
+
+    def __init__(self, sent: _DeviceCut) -> None:
+        """Make place for all patches."""
+        patches, points = sent.index.shape
+        self._agreement = Agreement(sent.index, sent.scales, sent.radii)
+        self._said = torch.empty(patches, points + 1, 3, dtype=torch.float32, device=sent.index.device)
+
+    def add(self, some: slice, x: torch.Tensor, said: torch.Tensor) -> None:
+        """Hear some of the patches, x (B, P, 3); said: what `OnDevice._begin` returned, (B, P + 1, 3)."""
+        self._agreement.add(some, x, said[:, :-1], said[:, -1, :1])
+        self._said[some] = said
+
+    def of_patches(self, batch: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return what `OnDevice._move` takes of some patches: their d, and both velocities."""
+        said = self._said[batch]
+        distance = said[:, -1, :1]
+        return distance, said[:, :-1], self._agreement.velocities(batch, distance)
 
 
 def _look_around(points: torch.Tensor, cut: Patches, sent: _DeviceCut, around: torch.Tensor, batch: slice) -> None:

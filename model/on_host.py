@@ -10,8 +10,9 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from straightpcf.model.agreement import Agreement
 from straightpcf.model.patches import Patches
-from straightpcf.model.processor import Finish, Floats, Forward, cut_out
+from straightpcf.model.processor import Finish, Floats, Network, cut_out
 from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling
 
@@ -24,32 +25,50 @@ _Item = TypeVar("_Item")
 class OnHost:
     """The Processor of the CPU, on threads of its own."""
 
-    def __init__(self, forward: Forward, distances: Callable[[torch.Tensor], torch.Tensor], threads: int) -> None:
-        self._forward, self._distances, self._threads = forward, distances, threads
+    def __init__(self, network: Network, threads: int) -> None:
+        self._network, self._threads = network, threads
         self._pool = ThreadPoolExecutor(threads, initializer=_one_thread)
 
     def displacements(
-        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
-    ) -> Iterator[_T]:
+        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
+        *, agree: bool,
+    ) -> Iterator[_T | None]:  # fmt: skip
         """Evaluate few patches ahead, so that a slow reader does not fill the memory."""
         points = torch.from_numpy(positions)
+        parts = (torch.from_numpy(part) for part in (cut.index, scales, cut.radii))
+        agreement = Agreement(*parts) if agree else None
+        heard: list[tuple[torch.Tensor, torch.Tensor]] = []  # of each patch its first velocities, and d
+
+        def known(patch: int) -> torch.Tensor | None:
+            return torch.tensor([[known_distances[patch]]]) if patch in known_distances else None
+
+        def begin(patch: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            x, distance = _cut_out(points, cut, scales, patch), known(patch)
+            return x, self._network.begin(x), self._network.distance(x) if distance is None else distance
 
         def move(patch: int) -> _T:
-            known = known_distances.get(patch)
-            distance = None if known is None else torch.tensor([[known]])
-            owned = int(cut.owned[patch])
-            x = _cut_out(points, cut, scales, patch)
-            moved = self._forward(x, torch.tensor([owned]), distance, max(1, owned))[0, :owned]
+            x, owned = _cut_out(points, cut, scales, patch), int(cut.owned[patch])
+            distance, first = known(patch), None
+            if agreement is not None:
+                velocities, distance = heard[patch]
+                first = velocities, agreement.velocities(slice(patch, patch + 1), distance)
+            moved = self._network.forward(x, torch.tensor([owned]), distance, first, max(1, owned))[0, :owned]
             return finish(patch, moved.double().numpy())
 
-        yield from self.mapper(move, range(len(cut.seeds)))
+        every = range(len(cut.seeds))
+        if agreement is not None:
+            for patch, (x, velocities, distance) in zip(every, self.mapper(begin, every), strict=True):
+                agreement.add(slice(patch, patch + 1), x, velocities, distance)
+                heard.append((velocities, distance))
+                yield None
+        yield from self.mapper(move, every)
 
     def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
         points = torch.from_numpy(positions)
 
         def read(patch: int) -> float:
-            return float(self._distances(_cut_out(points, cut, scales, patch)))
+            return float(self._network.distance(_cut_out(points, cut, scales, patch)))
 
         return np.array(list(self.mapper(read, range(len(cut.seeds)))))
 

@@ -12,13 +12,12 @@ import torch
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["Finish", "Floats", "Forward", "Mapper", "Processor", "cut_out"]
+__all__ = ["Finish", "First", "Floats", "Mapper", "Network", "Processor", "cut_out"]
 
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
 Floats = npt.NDArray[np.float64]
-# x (B, P, 3), owned (B,), distance (B, 1) or None, rows -> how far the first `rows` points move, (B, rows, 3)
-Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], torch.Tensor]
+First = tuple[torch.Tensor, torch.Tensor]  # velocities (B, P, 3) of the first evaluation, and what takes their place
 Finish = Callable[[int, Floats], _T]  # a patch's number and how far its points move -> what is made of it
 
 
@@ -29,16 +28,43 @@ class Mapper(Protocol):
         """Yield what the calls return, in the items' order; they are made in any."""
 
 
+class Network(Protocol):
+    """What a Processor runs on patches; all tensors are float32 but owned, (B,), int64."""
+
+    def distance(self, x: torch.Tensor) -> torch.Tensor:
+        """Return what the DistanceModule says of patches x (B, P, 3): (B, 1)."""
+
+    def begin(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the velocities of the first evaluation: (B, P, 3)."""
+
+    def forward(
+        self, x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, first: First | None, rows: int
+    ) -> torch.Tensor:
+        """Return how far the first `rows` points of patches move in a pass, (B, rows, 3); right for those owned.
+
+        distance: (B, 1), where the DistanceModule has been asked; first: the velocities of the first evaluation, where
+        that was made, and what takes their place.
+        """
+
+
 class Processor(Protocol):
     """Where patches are evaluated. positions: (N, 3), in the unit ball; scales: (M,), one for each patch of cut."""
 
     def displacements(
-        self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T]
-    ) -> Iterator[_T]:
+        self,
+        positions: Floats,
+        cut: Patches,
+        scales: Floats,
+        known_distances: Mapping[int, float],
+        finish: Finish[_T],
+        *,
+        agree: bool,
+    ) -> Iterator[_T | None]:
         """Yield patch after patch what `finish` returns of its number and of how far its points move, in its own scale.
 
         The points that it owns, (owned, 3). known_distances: what the DistanceModule said of patches before, by number.
-        finish is called on threads, in any order.
+        finish is called on threads, in any order. agree: what overlapping patches say of a point in the first
+        evaluation is joined (`Agreement`); for each patch that has been heard, None is yielded before all others.
         """
 
     def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:

@@ -32,6 +32,11 @@ MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patc
 _FEW_POINTS = 500
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
+_HEARD, _MOVED = 7, 13  # what a pass takes until all patches have been heard, and from there on, in parts of its time
+_Step = tuple[
+    npt.NDArray[np.int32], npt.NDArray[np.float64], bool
+]  # rows, how far they go, whether they were held back
+_NOTHING: _Step = (np.empty(0, dtype=np.int32), np.empty((0, 3)), False)
 
 
 @dataclass(frozen=True)
@@ -214,7 +219,7 @@ class Run:
     def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all
         reading = self.readings[-1]
-        points_done, whole = 0, len(reading.parts) * len(positions)
+        heard, done, whole = 0, 0, len(reading.parts) * len(positions)  # points
         steps = [np.zeros_like(positions) for _ in reading.parts[1:]]  # all but the last, which is settled as it comes
         # The patches are cut from `positions`, so results may be written into self.moved as they come.
         for number, cut in self._cuts(positions, tiling, reading.parts):
@@ -227,10 +232,15 @@ class Run:
                 zoom = self.reader.zooms(positions, cut, reading)
                 scales = patch_scales(cut.radii, scene=reading.scene, zoom=zoom)
             finish = partial(self._restrained_step, positions, cut, scales, reading, trusted_noise)
-            steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish)
-            for owned, step, held_back in steps_made:
+            agree = self.filter.agree and len(cut.seeds) > 1
+            unheard = iter(cut.owned.tolist())
+            steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish, agree=agree)
+            for made in steps_made:
+                owned, step, held_back = made or _NOTHING
                 self.held_back[owned] |= held_back
-                points_done += len(owned)
+                done += len(owned)
+                if made is None or not agree:
+                    heard += next(unheard)
                 if number < len(steps):
                     steps[number][owned], owned = step, owned[:0]
                 else:
@@ -239,7 +249,7 @@ class Run:
                 indices = self.rows[copies]
                 moved = self.moved[self.points.inverse[copies]]
                 xyz = self.xyz[indices] + self.options.strength * self.frame.radius * moved
-                self._progress = begun_at + points_done / whole * share
+                self._progress = begun_at + (_HEARD * heard + _MOVED * done) / ((_HEARD + _MOVED) * whole) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, self._progress)
 
     def _restrained_step(
@@ -251,7 +261,7 @@ class Run:
         trusted_noise: npt.NDArray[np.float64] | None,
         patch: int,
         displacement: npt.NDArray[np.float64],
-    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], bool]:
+    ) -> _Step:
         """Return the points that a patch owns, their step, and whether it was held back; on any thread."""
         owned, step = cut.owned_points(patch), displacement / scales[patch]
         if not self.filter.zoom:

@@ -22,6 +22,7 @@ MODEL = ROOT / "model"
 FILES = sorted(str(path.relative_to(MODEL)) for path in [*MODEL.glob("*.py"), *MODEL.glob("nets/*.py")])
 # What decides nothing about a result: memory and time, a file's format, rounding, or another name's consequence.
 NOT_TUNED = {
+    "agreement.py": {"_LEAST_DISTANCE", "_STEPS"},
     "allocator.py": {"_M_TRIM_THRESHOLD", "_M_TOP_PAD", "_M_MMAP_THRESHOLD", "_LARGEST_THRESHOLD", "_KEPT", "_PAD"},
     "checkpoint.py": {"MAX_COUPLINGS", "MAX_WIDTH", "MAX_OFFICIAL_BYTES"},
     "device_patches.py": {"_DISTANCES"},
@@ -35,6 +36,7 @@ NOT_TUNED = {
     "outliers.py": {"_BLOCK"},
     "patches.py": {"_TREE_HEIGHT"},
     "restraint.py": {"_LINE_FREEDOM"},  # of a mean and a direction
+    "run.py": {"_HEARD", "_MOVED", "_NOTHING"},
     "spread.py": {"_CHUNKS", "_TINY"},
     "turns.py": {"_PSI"},  # a root that the paper gives
 }

@@ -11,6 +11,8 @@ from straightpcf.model.nets.edgeconv import NEIGHBOURS, Decoder, Encoder
 __all__ = ["DistanceModule", "StraightPCF", "VelocityModule"]
 
 
+# What patches agree on in the first evaluation differs from what one of them says mostly as its later ones would.
+_AGREED_SHARE = 0.5
 _PATCHES_PER_RADIUS = 4.0  # the median patch of training has a quarter of its object's radius
 
 
@@ -74,6 +76,7 @@ class StraightPCF(nn.Module):
         full_evaluations: int = 1,
         distance: torch.Tensor | None = None,
         turns: torch.Tensor | None = None,
+        first: tuple[torch.Tensor, torch.Tensor] | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Move patches x (B, P, 3) along X += d / (N K) v_k(X) for N = euler_steps rounds.
 
@@ -83,18 +86,22 @@ class StraightPCF(nn.Module):
         that of the last of the first full_evaluations. The flow is straight (section 4.2), so that hardly changes
         what is seen of them (docs/kernels.md has the figures). turns: (T, 3, 3) rotations, one after the other for the
         evaluations: the network's errors depend on how a patch lies, and those of several positions average out.
+        first: the first evaluation's velocities (B, P, 3), made before (`first_velocities`), and what takes their place
+        (B, P, 3): by how much that differs, so much, times `_AGREED_SHARE`, is added to those of the later ones.
         """
         distance = self.distance_module(x) if distance is None else distance
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
         evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
         moving = torch.zeros_like(x)
         inside = None if owned is None else torch.arange(rows or x.shape[1], device=x.device) < owned[:, None]
+        differs = None if first is None else _AGREED_SHARE * (first[1] - first[0])
 
         def velocities(number: int, x: torch.Tensor, rows: int | None) -> torch.Tensor:
-            if turns is None:
-                return evaluations[number](x, rows)  # type: ignore[no-any-return]
-            turn = turns[number % len(turns)]
-            return evaluations[number](x @ turn, rows) @ turn.mT  # type: ignore[no-any-return]
+            if first is not None and number == 0:
+                return first[1][:, :rows]
+            turn = None if turns is None else turns[number % len(turns)]
+            found = _turned(evaluations[number], x, rows, turn)
+            return found if differs is None else found + differs[:, :rows]
 
         last = len(evaluations) - 1
         for done in range(last):
@@ -105,3 +112,14 @@ class StraightPCF(nn.Module):
                 moving = torch.cat([fresh, moving[:, inside.shape[1] :]], dim=1)
             x = x + step * moving
         return x[:, :rows] + step * velocities(last, x, rows), distance
+
+    def first_velocities(self, x: torch.Tensor, turns: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the velocities (B, P, 3) of the first evaluation that `forward` makes of patches x (B, P, 3)."""
+        return _turned(self.velocity_modules[0], x, None, None if turns is None else turns[0])
+
+
+def _turned(module: nn.Module, x: torch.Tensor, rows: int | None, turn: torch.Tensor | None) -> torch.Tensor:
+    """Return a module's velocities of the patches in another position, in their own."""
+    if turn is None:
+        return module(x, rows)  # type: ignore[no-any-return]
+    return module(x @ turn, rows) @ turn.mT  # type: ignore[no-any-return]

@@ -14,9 +14,10 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from straightpcf.model.filter import Filter
 from straightpcf.model.kernels import cuda
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.on_device import OnDevice, _DeviceCut
+from straightpcf.model.on_device import OnDevice, _DeviceCut, _Heard
 from straightpcf.model.patches import Patches
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
@@ -79,26 +80,35 @@ def test_the_network_of_a_pass_can_be_captured(*, read_before: bool) -> None:
 
 
 @pytest.mark.parametrize("known_distances", [{}, dict.fromkeys(range(40), 0.5)])
-def test_launching_a_batch_waits_for_nothing(known_distances: dict[int, float]) -> None:
+@pytest.mark.parametrize("agree", [False, True])
+def test_a_batch_waits_for_nothing(
+    known_distances: dict[int, float], *, agree: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     network, captured = on_device().requires_grad_(requires_grad=False), []
-
-    def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
-        moved: torch.Tensor = network(x, rows=rows, owned=owned, distance=distance)[0]
-        return moved
+    model = Filter(network, device="meta", threads=1)
 
     def capture(run: Any) -> tuple[Any, torch.Tensor]:
         captured.append(run)
         return run, run()
 
+    def place(index: torch.Tensor, *, return_inverse: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        return index.flatten()[:5000], index.long()  # once for a cut this waits
+
+    monkeypatch.setattr(torch, "unique", place)
     rows, each = np.arange(40), np.ones(40)
     cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
-    processor = OnDevice(forward, network.distance_module, "meta", batch=8, capture=capture)
+    processor = OnDevice(model, "meta", batch=8, capture=capture)
     points = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE)
     sent = _DeviceCut.of(cut, each, known_distances, DEVICE)
+    heard = _Heard(sent) if agree else None
     with OnCuda(), Captured():
         for first in range(0, 40, 8):
-            assert processor._launch(points, cut, sent, range(first, first + 8)).shape[0] == 8
-    assert len(captured) == 2  # rows up to 128 and to 256 come twice, up to 384 once
+            if heard is not None:
+                assert processor._hear(points, sent, heard, slice(first, first + 8)) == 8
+        for first in range(0, 40, 8):
+            assert processor._launch(points, cut, sent, range(first, first + 8), heard).shape[0] == 8
+    # Rows up to 128 and to 256 come twice, up to 384 once; the first evaluation is of all points.
+    assert len(captured) == (3 if agree else 2)
 
 
 @pytest.mark.parametrize("loss", [velocity_loss, coupled_loss, distance_loss])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def on_device(
     network: torch.nn.Module, *, batch: int = 4, capture: Capture = capture_by_calling, tile_points: int | None = None
 ) -> Filter:
     model = Filter(network, threads=1, coverage=3, tile_points=tile_points)  # type: ignore[arg-type]
-    model.processor = OnDevice(model.forward, model.distance, "cpu", batch=batch, capture=capture)
+    model.processor = OnDevice(model, "cpu", batch=batch, capture=capture)
     return model
 
 
@@ -77,21 +78,21 @@ def test_neighbours_of_a_patch_spread_points_as_neighbours_of_the_cloud_do(netwo
 def test_a_shape_is_captured_when_it_comes_again_and_reads_fresh_inputs() -> None:
     captured = []
 
-    def forward(x: torch.Tensor, owned: torch.Tensor, distance: torch.Tensor | None, rows: int) -> torch.Tensor:
-        return x[:, :rows] * owned[:, None, None] * (1 if distance is None else distance[:, :, None])
+    def compute(rows: int, x: torch.Tensor, owned: torch.Tensor, *distance: torch.Tensor) -> torch.Tensor:
+        return x[:, :rows] * owned[:, None, None] * (distance[0][:, :, None] if distance else 1)
 
     def capture(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
         captured.append(run)
         return capture_by_calling(run)
 
-    graphs = Graphs(forward, capture)
+    graphs = Graphs(compute, capture)
     for turn in range(4):
         x, owned = torch.rand(2, 1000, 3), torch.tensor([turn, 1])
-        torch.testing.assert_close(graphs(x, owned, None, 400), x[:, :512] * owned[:, None, None])
+        torch.testing.assert_close(graphs(400, x, owned), x[:, :512] * owned[:, None, None])
         distance = torch.rand(2, 1)
         expected = x[:, :1000] * (owned[:, None] * distance)[:, :, None]
-        torch.testing.assert_close(graphs(x, owned, distance, 950), expected)
-        graphs(torch.rand(2, 700, 3), owned, None, 700)  # patches of small clouds have a size each: no graphs for them
+        torch.testing.assert_close(graphs(950, x, owned, distance), expected)
+        graphs(700, torch.rand(2, 700, 3), owned)  # patches of small clouds have a size each: no graphs for them
         assert len(captured) == (2 if turn else 0)
 
 
@@ -102,11 +103,11 @@ def test_the_graph_that_was_used_last_is_given_up_last() -> None:
         captured.append(run)
         return capture_by_calling(run)
 
-    graphs = Graphs(lambda x, owned, distance, rows: x[:, :rows], capture)
+    graphs = Graphs(lambda rows, x: x[:, :rows], capture)
 
     def call(batch: int) -> None:
         for _ in range(2):
-            graphs(torch.rand(batch, 1000, 3), torch.ones(batch), None, 1000)
+            graphs(1000, torch.rand(batch, 1000, 3))
 
     for batch in range(1, 17):
         call(batch)
@@ -137,6 +138,10 @@ class _SmallMemory(torch.nn.Module):
         super().__init__()
         self.network, self.most = network, most
         self.distance_module = network.distance_module
+
+    def first_velocities(self, x: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = self.network.first_velocities(x, turns)
+        return found
 
     def forward(self, x: torch.Tensor, **how: Any) -> tuple[torch.Tensor, torch.Tensor]:
         if len(x) > self.most:
@@ -171,8 +176,8 @@ def test_out_of_memory_halves_the_batch_of_what_reads_and_spreads_too(
     tiling = Tiling(ball, split(ball, 10_000), coverage=3, seed=0)
     cut = next(tiling.cuts())
     scales = np.ones(len(cut.seeds))
-    large = OnDevice(network.forward, network.distance_module, "cpu", batch=8)  # type: ignore[arg-type]
-    small = OnDevice(network.forward, most(network.distance_module), "cpu", batch=8)  # type: ignore[arg-type]
+    large, small = (OnDevice(Filter(network, threads=1), "cpu", batch=8) for _ in range(2))
+    monkeypatch.setattr(small, "_network", SimpleNamespace(distance=most(network.distance_module)))
     np.testing.assert_allclose(small.distances(ball, cut, scales), large.distances(ball, cut, scales), atol=1e-6)
     assert small.batch == 2
     expected = large.spread(ball, tiling, 1.0)

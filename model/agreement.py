@@ -1,0 +1,48 @@
+"""What overlapping patches say of a point in a pass's first evaluation, and what they agree on."""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["Agreement"]
+
+# Near its rim a patch lacks neighbours: what it says of a point there counts for less, and for this at least.
+_SHARPNESS, _LEAST_WEIGHT = 2.0, 1e-3
+_LEAST_DISTANCE = 1e-6  # bounds a division; the step that comes of it is as small
+# Sums are of integers, so that the order in which patches come, and on a device threads, changes nothing.
+_STEPS = 2.0**40  # of the unit ball's radius
+
+
+class Agreement:
+    """A mean over the patches that a point is in, for the points of M patches of P.
+
+    A patch's first evaluation is made for all of its points, so each point has a velocity from every patch that it is
+    in, of which only the owner's was used. What differs between them is the network's error, and the mean has less.
+    """
+
+    def __init__(self, index: torch.Tensor, scales: torch.Tensor, radii: torch.Tensor) -> None:
+        """Take the rows of the points of each patch, index (M, P), in what size it is shown, and its radius, (M,).
+
+        What is summed is where these are.
+        """
+        points, self._place = torch.unique(index, return_inverse=True)
+        self._sums = torch.zeros(len(points), 4, dtype=torch.int64, device=index.device)
+        self._scales, self._reach = scales[:, None, None], (scales * radii)[:, None]
+
+    def add(self, patches: slice, x: torch.Tensor, velocities: torch.Tensor, distance: torch.Tensor) -> None:
+        """Hear some of the patches: x, as they are shown, and velocities, both (B, P, 3), and d (B, 1)."""
+        from_seed = torch.linalg.vector_norm(x.double(), dim=2) / self._reach[patches]
+        weight = (1 - from_seed.nan_to_num()).clamp(min=_LEAST_WEIGHT).pow(_SHARPNESS)[:, :, None]
+        steps = _bounded(distance) * velocities / self._scales[patches]
+        said = torch.cat([weight * steps, weight], dim=2)
+        self._sums.index_add_(0, self._place[patches].flatten(), (_STEPS * said).round().long().flatten(0, 1))
+
+    def velocities(self, patches: slice | torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
+        """Return what is agreed on for some patches, as velocities (B, P, 3) float32 that their d (B, 1) scales."""
+        sums = self._sums[self._place[patches]].double()
+        steps = sums[:, :, :3] / sums[:, :, 3:]
+        return (steps * self._scales[patches] / _bounded(distance)).float()
+
+
+def _bounded(distance: torch.Tensor) -> torch.Tensor:
+    return distance.clamp(min=_LEAST_DISTANCE)[:, :, None]
