@@ -44,11 +44,12 @@ class StoreThread:
     async def close(self) -> None:
         """Close the store behind the last transaction."""
         await asyncio.get_running_loop().run_in_executor(self._thread, self._store.close)
+        self._file.close()
         self._thread.shutdown()
 
     @property
     def in_place(self) -> bool:
-        """Tell whether the store's file is where it was opened."""
+        """Tell whether the store's file is where it was opened, and nobody else wrote into it."""
         return self._file.in_place
 
     async def __call__(
@@ -57,7 +58,7 @@ class StoreThread:
         """Make one transaction; it is carried out even if the caller is cancelled.
 
         Raises SpoolFull where the disk is full (what makes room there takes the reserve), OSError where the store's
-        file was deleted or replaced, and sqlite3.OperationalError where others lock it for LOCK_SECONDS.
+        file was deleted, replaced or overwritten, and sqlite3.OperationalError where others lock it for LOCK_SECONDS.
         """
         asked = time.monotonic()
 
@@ -70,6 +71,8 @@ class StoreThread:
                 if not (function in _MAKES_ROOM and is_full(exc) and release_reserve(self._data_dir)):
                     raise
                 return function(self._store, *args, **kwargs)
+            finally:
+                self._file.keep_up()
 
         with full_disk_as_spool_full():
             return await asyncio.get_running_loop().run_in_executor(self._thread, carry_out)
