@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.service.engines import until
 from tests.service.in_process import serving
-from tests.service.test_races import CLOUD, play, willing
+from tests.service.test_races import CLOUD, POST, play, willing
 
 REFUSED = b"PUT /nowhere HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n"
 GOOD = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -43,6 +44,25 @@ def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> 
             writer.write(asked)
             answer = await asyncio.wait_for(reader.read(), timeout=20)
             assert (first + answer).count(b"HTTP/1.1 20") == 2
+            writer.close()
+
+    play(scenario)
+
+
+def test_one_whose_peer_closes_half_of_it_is_taken_for_gone_and_frees_the_worker(tmp_path: Path) -> None:
+    """A peer that closed all of it sends no other sign; docs/api.md says so."""
+
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(POST)
+            await until(lambda: backend.runs)
+            writer.write_eof()
+            assert await asyncio.wait_for(reader.read(), timeout=10) == b""
+            while (await engine.list())[0]:
+                await asyncio.sleep(0.01)
             writer.close()
 
     play(scenario)
