@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
 
 from tests.service.engines import until
+from tests.service.fakes import ObedientBackend
 from tests.service.in_process import serving
 from tests.service.test_races import CLOUD, POST, play, willing
 
@@ -28,6 +30,55 @@ def test_one_that_falls_silent_is_closed(tmp_path: Path, parts: list[bytes]) -> 
             writer.close()
 
     play(scenario)
+
+
+BROKEN = {
+    b"GET /livez HTTP/1.1\r\n\r\n": "Missing mandatory Host: header",
+    b"\x16\x03\x01\x02\x00 TLS, perhaps\r\n\r\n": "illegal request line",
+    b"PUT /jobs/a HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n": "bad Content-Length",
+    b"PUT /jobs/a HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n": "illegal chunk header",
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_what_is_no_http_is_told_so_by_a_problem(
+    tmp_path: Path, broken: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(broken)
+            head, body = (await asyncio.wait_for(reader.read(), timeout=10)).split(b"\r\n\r\n")
+            problem = json.loads(body)
+            assert head.startswith(b"HTTP/1.1 400 ")
+            assert b"application/problem+json" in head
+            assert (problem["code"], problem["status"]) == ("invalid_request", 400)
+            assert problem["request_id"].encode() in head
+            assert BROKEN[broken] in problem["detail"]
+            assert not (await engine.list())[0]
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("asked", [b"livez", b"jobs/a/events"])
+def test_what_comes_behind_an_answer_and_is_no_http_is_no_fault(
+    tmp_path: Path, asked: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(b"PUT /jobs/a?filename=a.xyz HTTP/1.1\r\nHost: [::1]\r\nContent-Length: 6\r\n\r\n1 2 3\n")
+            await reader.readuntil(b"}}")
+            writer.write(b"GET /%b HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" % asked)
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(b"zz\r\n")
+            await asyncio.wait_for(reader.read(), timeout=10)
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 @pytest.mark.parametrize("together", [True, False])
