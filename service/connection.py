@@ -1,10 +1,17 @@
-"""One HTTP connection: closed where nothing comes on it and nothing is to be answered, so that no peer keeps it."""
+"""One HTTP connection: closed where nothing comes and nothing is to be answered, and where what comes is no HTTP."""
 
 from __future__ import annotations
 
 import asyncio
+import sys
 
+import h11
+from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from straightpcf.points.errors import InvalidRequest
+from straightpcf.service.api.errors import problem_response
+from straightpcf.service.api.request_id import usable_id
 
 __all__ = ["connection_class"]
 
@@ -24,6 +31,18 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
         def data_received(self, data: bytes) -> None:
             super().data_received(data)
             self._be_patient()
+
+        def send_400_response(self, msg: str) -> None:
+            """Answer what is no HTTP, where no answer has begun, and close."""
+            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+                if self.cycle is not None:
+                    self.cycle.disconnected = True  # of a body that broke off: the app's answer would be one more
+                asked = Request({"type": "http", "request_id": usable_id(None)})
+                problem = problem_response(asked, InvalidRequest(f"this is no HTTP/1.1: {sys.exc_info()[1]}"), 400)
+                head = h11.Response(status_code=400, headers=[*problem.raw_headers, (b"connection", b"close")])
+                for event in (head, h11.Data(data=bytes(problem.body)), h11.EndOfMessage()):
+                    self.transport.write(self.conn.send(event) or b"")
+            self.transport.close()
 
         def _be_patient(self) -> None:
             is_answering = self.cycle is not None and not self.cycle.response_complete

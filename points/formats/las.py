@@ -13,12 +13,21 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count, check_room
-from straightpcf.points.formats.las_layout import EXTRA_BYTES_ID, LASZIP_ID, LasHeader, dimensions, read_header
+from straightpcf.points.formats.las_layout import (
+    EXTRA_BYTES_ID,
+    LASZIP_ID,
+    LasHeader,
+    dimensions,
+    is_geographic,
+    read_header,
+)
 from straightpcf.points.formats.las_new import TYPES, check_new, new_las
 from straightpcf.points.formats.laz_codec import check_packing, pack, packing_record, unpack
 from straightpcf.points.formats.positions import AXES, moved
 
 __all__ = ["Las", "Laz"]
+
+_DEGREES_SCALE = 1.0001e-5  # a metre; scans in metres have 0.01 to 0.0001
 
 
 @dataclass(frozen=True)
@@ -63,6 +72,8 @@ class Las(Format):
         rows = rows.reshape(header.points, header.row_bytes)
         integers = np.ascontiguousarray(rows[:, :12]).view("<i4").reshape(header.points, 3)
         xyz = integers * header.scales + header.offsets
+        if is_geographic(header):
+            _refuse_degrees(xyz, header)
         source = LasSource(raw, header, rows, xyz.copy())
         return PointCloud(xyz, dimensions(rows, header), source, beside=_records(header))
 
@@ -103,6 +114,15 @@ class Laz(Las):
     suffixes: ClassVar[tuple[str, ...]] = (".laz",)
     media_type = "application/vnd.laszip"
     is_compressed = True
+
+
+def _refuse_degrees(xyz: npt.NDArray[np.float64], header: LasHeader) -> None:
+    """Raise where x and y can be what a record says they are: a scan in metres may be said to be in degrees, too."""
+    if (np.abs(xyz[:, :2]) <= (360, 90)).all() and np.abs(header.scales[:2]).max() <= _DEGREES_SCALE:
+        raise UnsupportedCloud(
+            f"the LAS records say that x and y are degrees, and scales {header.scales[:2].tolist()} do not deny it: no "
+            "distance can be told in them: project the points first (easting, northing, height)"
+        )
 
 
 def _records(header: LasHeader) -> tuple[str, ...]:

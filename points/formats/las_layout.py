@@ -20,6 +20,7 @@ __all__ = [
     "LasHeader",
     "LasRecord",
     "dimensions",
+    "is_geographic",
     "read_header",
     "standard_bytes",
     "standard_dimensions",
@@ -29,6 +30,9 @@ __all__ = [
 LASZIP_ID = (b"laszip encoded", 22204)
 EXTRA_BYTES_ID = (b"LASF_Spec", 4)
 COPC_ID = (b"copc", 1)
+_GEO_KEYS_ID, _WKT_ID = (b"LASF_Projection", 34735), (b"LASF_Projection", 2112)
+_GEOGRAPHIC = (1024, 0, 1, 2)  # GTModelTypeGeoKey, its value in place, one of them: latitude and longitude
+_OTHER_SYSTEMS = (b"PROJCS[", b"PROJCRS[", b"GEOCCS[", b"LOCAL_CS[", b"ENGCRS[")
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 _RECORD_BYTES = 54
 _EXTRA_STRUCT_BYTES = 192
@@ -162,6 +166,17 @@ def read_header(raw: bytes) -> LasHeader:
     if header.record(*COPC_ID) is not None:
         raise UnsupportedCloud("a COPC file is indexed by position, which cannot be kept: convert it to LAZ first")
     return header
+
+
+def is_geographic(header: LasHeader) -> bool:
+    """Tell whether a record says that x and y are longitude and latitude."""
+    keys, wkt = header.record(*_GEO_KEYS_ID), header.record(*_WKT_ID)
+    if wkt is not None and any(system in wkt.data for system in _OTHER_SYSTEMS):
+        return False
+    if wkt is not None and (b"GEOGCS[" in wkt.data or b"GEOGCRS[" in wkt.data):
+        return True
+    data = keys.data if keys is not None else b""
+    return _GEOGRAPHIC in struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
 
 
 def _records(raw: bytes, at: int, count: int, limit: int) -> tuple[tuple[LasRecord, ...], int]:

@@ -30,7 +30,13 @@ _POSITIONS = (
     ("x1", "y1", "z1"),  # Ouster's first returns
     ("0", "1", "2"),  # pandas' numbers of columns
 )
+# What says that no x, y, z are there, where words of both sets are among the names.
 _DEGREES = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"})
+_POLAR = (
+    {"azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"},
+    {"range", "distance", "dist", "radius", "r", "rho", "elevation", "elev", "el", "zenith", "inclination"},
+)
+_NO_LETTERS = re.compile(r"[^a-z]+")
 _UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
 _LEAD = re.compile(rb"^[^,;\t:]*:\s+")  # columns: x y z
@@ -60,10 +66,15 @@ def named_columns(
             if axes := _axes(words):
                 once = [word if word and words.count(word) == 1 else "" for word in words]
                 return tuple(word or label for word, label in zip(once, labels, strict=True)), axes
-        if title and any(_are_degrees(words) for words in fitting):
+        if title and any(_hold(_DEGREES, words) for words in fitting):
             raise MalformedFile(
                 f"the names above line {line} are of degrees: {shown(title.text)}; no distance can be told in them: "
                 "project the points first (easting, northing, height)"
+            )
+        if title and any(_hold(_POLAR, words) for words in fitting):
+            raise MalformedFile(
+                f"the names above line {line} are of angles: {shown(title.text)}; no distance can be told in them: "
+                "turn them into x, y, z first"
             )
         if title is names and columns > 3:  # a remark may be any text
             _refuse(title, line, columns, marks, fits=bool(fitting))
@@ -129,9 +140,10 @@ def _refuse(names: Title | None, line: int, columns: int, marks: Sequence[bytes]
             raise MalformedFile(f"{said}; line {line} has {columns}, so which of them are x, y, z is not known")
 
 
-def _are_degrees(words: Sequence[str]) -> bool:
-    plain = {_UNIT.sub("", word).lower() for word in words}
-    return all(plain & names for names in _DEGREES)
+def _hold(sets: Sequence[set[str]], words: Sequence[str]) -> bool:
+    """Tell whether something of every set is among names such as `lat`, `gps_lon` and `Range [m]`."""
+    plain = {part for word in words for part in _NO_LETTERS.split(_UNIT.sub("", word).lower())}
+    return all(plain & names for names in sets)
 
 
 def _axes(words: Sequence[str]) -> tuple[int, int, int] | None:

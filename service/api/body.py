@@ -26,6 +26,7 @@ MAX_PREAMBLE_BYTES = 2**16
 WRITE_BYTES = 2**20
 LOOK_SECONDS = 0.25
 
+_CUT_BY_CURL = (b"\n", b"\r", b"\0")  # one of them is in every file of more than one point
 _AS_IT_IS = (b"binary", b"8bit", b"7bit")  # of a part of a form: RFC 7578, 4.7
 
 _T = TypeVar("_T")
@@ -90,17 +91,25 @@ async def _receive(request: Request, target: Path, engine: Engine) -> Upload:
         if kind == b"multipart/form-data":
             upload = await _receive_form(request, parameters.get(b"boundary", b""), spool, engine.limits)
         else:
-            upload = await _receive_raw(request, spool, engine.limits)
+            is_form = kind == b"application/x-www-form-urlencoded"
+            upload = await _receive_raw(request, spool, engine.limits, may_be_cut=is_form)
         await spool.flush()
     return upload
 
 
-async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits) -> Upload:
+async def _receive_raw(request: Request, spool: SpoolFile, limits: Limits, *, may_be_cut: bool) -> Upload:
+    """Receive a body as it is; may_be_cut: refuse one that seems to have lost its line ends, as in `curl -d @file`."""
     received, chunks = 0, request.stream()
     while (chunk := await next_part(chunks, limits)) is not None:
         limits.check_bytes(received := received + len(chunk))
+        may_be_cut = may_be_cut and not any(mark in chunk for mark in _CUT_BY_CURL)
         spool.buffer += chunk
         await spool.flush(above=WRITE_BYTES)
+    if may_be_cut and received:
+        raise InvalidRequest(
+            f"the body is application/x-www-form-urlencoded, and none of its {received} bytes is a line end or 0: no "
+            f"cloud is so. `curl -d` leaves them out: send the file with -T, --data-binary or -F {FILE_FIELD}=@..."
+        )
     return Upload(name=disposition_name(request.headers.get("content-disposition", "")))
 
 

@@ -16,6 +16,7 @@ from straightpcf.service.jobs.full_disk import is_full, release_reserve
 __all__ = ["OpenedFile", "check_database", "open_database", "transaction"]
 
 SCHEMA_VERSION = 1
+_WAL_INDEX_HEAD = 136  # bytes: of the -wal the salts, the pages that are moved and those that are about to be
 _BUSY_SECONDS = 30.0  # while it is opened: of several servers that start at once, one upgrades it
 # Every upload asks again and again for what is kept, beside the rows of all that has expired. Of a column that may have
 # to come first.
@@ -26,24 +27,41 @@ class OpenedFile:
     """Remember which files were opened: SQLite goes on writing to those that were deleted or replaced, and it is lost.
 
     Beside the database its -wal, where the last commits are, and its -shm, by which processes know of each other: they
-    are the same for as long as it is open, on a disk where SQLite has them.
+    are the same for as long as it is open, on a disk where SQLite has them. Close it behind the database: in one
+    process a closed descriptor of -shm takes SQLite's locks away.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        parts = [path.with_name(f"{path.name}-{part}") for part in ("wal", "shm")]
-        self._opened = {path: path.stat()} | {part: part.stat() for part in parts if part.exists()}
+        wal, shm = (path.with_name(f"{path.name}-{part}") for part in ("wal", "shm"))
+        self._opened = {path: path.stat()} | {part: part.stat() for part in (wal, shm) if part.exists()}
+        self._shm = os.open(shm, os.O_RDONLY) if shm in self._opened else None
+        self._seen = self._look()
+
+    def close(self) -> None:
+        """Let go of the descriptor."""
+        if self._shm is not None:
+            os.close(self._shm)
+            self._shm = None
 
     @property
     def in_place(self) -> bool:
-        """Tell whether they are still there."""
-        return self._lost() is None
+        """Tell whether they are still there, and the database is SQLite's own."""
+        return self._lost() is None and not self._is_overwritten()
 
     def check(self) -> None:
-        """Raise OSError if they are not."""
+        """Raise OSError if they are not, or the database was overwritten."""
         if (lost := self._lost()) is not None:
             way = "put it back, or restart the server and its jobs are lost" if lost == self._path else "restart it"
             raise OSError(errno.ESTALE, f"deleted or replaced under this server: {way}", str(lost))
+        if self._is_overwritten():
+            way = "stop it, and only then put there what is to be there"
+            raise OSError(errno.ESTALE, f"overwritten under this server: {way}", str(self._path))
+
+    def keep_up(self) -> None:
+        """Look behind a transaction of one's own, which may have moved the -wal."""
+        with suppress(OSError):  # it is gone: the next check says so
+            self._is_overwritten()
 
     def _lost(self) -> Path | None:
         for path, opened in self._opened.items():
@@ -54,6 +72,24 @@ class OpenedFile:
             if not is_same:
                 return path
         return None
+
+    def _is_overwritten(self) -> bool:
+        """Tell whether somebody wrote into the database who moved nothing there from the -wal, as SQLite alone does."""
+        moved, written = now = self._look()
+        if moved is not None and written != self._seen[1] and moved == self._seen[0]:
+            return True
+        self._seen = now
+        return False
+
+    def _look(self) -> tuple[bytes | None, tuple[int, int]]:
+        """Return how far the -wal is moved into the database (sqlite.org/walformat.html), and when that was written.
+
+        In this order: what is written after the look is said to be moved after it, too. None while it is being moved.
+        """
+        head = b"" if self._shm is None else os.pread(self._shm, _WAL_INDEX_HEAD, 0)
+        salts, done, begun = head[32:40], head[96:100], head[128:132]
+        stat = self._path.stat()
+        return salts + done if head and done == begun else None, (stat.st_size, stat.st_mtime_ns)
 
 
 def check_database(path: Path) -> None:

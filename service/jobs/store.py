@@ -70,6 +70,10 @@ class JobStore:
         """Let the next method wait at most so long for other processes."""
         self._db.execute(f"PRAGMA busy_timeout = {int(1000 * seconds)}")
 
+    def empty_wal(self) -> None:
+        """Move what is in the -wal into the database: what is written next takes its place, and no more of the disk."""
+        self._db.execute("PRAGMA wal_checkpoint")
+
     # --- what clients ask for
 
     def create(self, job: NewJob) -> tuple[JobRecord, bool]:
@@ -198,8 +202,7 @@ class JobStore:
         with self._transaction():
             mine = self._update(id, fence, "state = 'processing'")
             if mine:
-                attempts = self._row(id)["attempts"]
-                self._add_event(id, "start", {"attempt": attempts, "device": device})
+                self._add_event(id, "start", {"attempt": self._row(id)["attempts"], "device": device})
             return mine
 
     def note(
@@ -287,8 +290,7 @@ class JobStore:
 
     def servers(self) -> set[str]:
         """Name the servers that hold jobs."""
-        query = f"SELECT DISTINCT server FROM jobs WHERE state IN {_WORKING}"
-        return {row["server"] for row in self._db.execute(query)}
+        return {name for (name,) in self._db.execute(f"SELECT DISTINCT server FROM jobs WHERE state IN {_WORKING}")}
 
     def unknown(self, folders: Collection[str]) -> list[str]:
         """Return those folders that no job owns."""

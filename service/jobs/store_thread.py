@@ -7,6 +7,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -44,11 +45,12 @@ class StoreThread:
     async def close(self) -> None:
         """Close the store behind the last transaction."""
         await asyncio.get_running_loop().run_in_executor(self._thread, self._store.close)
+        self._file.close()
         self._thread.shutdown()
 
     @property
     def in_place(self) -> bool:
-        """Tell whether the store's file is where it was opened."""
+        """Tell whether the store's file is where it was opened, and nobody else wrote into it."""
         return self._file.in_place
 
     async def __call__(
@@ -57,7 +59,7 @@ class StoreThread:
         """Make one transaction; it is carried out even if the caller is cancelled.
 
         Raises SpoolFull where the disk is full (what makes room there takes the reserve), OSError where the store's
-        file was deleted or replaced, and sqlite3.OperationalError where others lock it for LOCK_SECONDS.
+        file was deleted, replaced or overwritten, and sqlite3.OperationalError where others lock it for LOCK_SECONDS.
         """
         asked = time.monotonic()
 
@@ -67,9 +69,25 @@ class StoreThread:
             try:
                 return function(self._store, *args, **kwargs)
             except sqlite3.Error as exc:
-                if not (function in _MAKES_ROOM and is_full(exc) and release_reserve(self._data_dir)):
+                if not (is_full(exc) and self._made_room(take_reserve=function in _MAKES_ROOM)):
                     raise
                 return function(self._store, *args, **kwargs)
+            finally:
+                self._file.keep_up()
 
         with full_disk_as_spool_full():
             return await asyncio.get_running_loop().run_in_executor(self._thread, carry_out)
+
+    def _made_room(self, *, take_reserve: bool) -> bool:
+        """Tell whether a full disk has room for a transaction now: where the -wal was, if it could be emptied.
+
+        Were the reserve left to what is written next, renewed leases would use it up within a minute.
+        """
+        try:
+            self._store.empty_wal()
+        except sqlite3.Error as exc:
+            if not (is_full(exc) and take_reserve and release_reserve(self._data_dir)):
+                return False
+            with suppress(sqlite3.Error):
+                self._store.empty_wal()
+        return True

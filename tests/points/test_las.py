@@ -302,3 +302,35 @@ def test_extra_bytes_are_read_with_their_scale_and_offset_and_kept_as_they_are(t
     np.testing.assert_array_equal(again.points.array["Amplitude"], theirs.points.array["Amplitude"])
     write_cloud(cloud, tmp_path / "a.ply", format_named("ply"))
     np.testing.assert_allclose(read_cloud(tmp_path / "a.ply")[0].attributes["Amplitude"], np.arange(N) * 0.25)
+
+
+WGS84 = b'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["degree",0.0174532925199433]]'
+UTM = b'PROJCS["WGS 84 / UTM zone 32N",' + WGS84 + b',PROJECTION["Transverse_Mercator"],UNIT["metre",1]]'
+SYSTEMS = {
+    "WGS84": (2112, WGS84),
+    "WGS84 and heights": (2112, b'COMPD_CS["a",' + WGS84 + b',VERT_CS["b"]]'),
+    "WGS84 of 2019": (2112, b'GEOGCRS["WGS 84",CS[ellipsoidal,2]]'),
+    "UTM": (2112, UTM),
+    "keys of WGS84": (34735, struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 2, 2048, 0, 1, 4326)),
+    "keys of UTM": (34735, struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 32632)),
+    "a part of keys": (34735, b"\1\0\1"),
+}
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(("scale", "east"), [(1e-6, 9.2), (1e-6, 400.0), (1e-3, 9.2)])
+def test_longitude_and_latitude_are_refused_where_a_record_and_the_numbers_say_so(
+    system: str, scale: float, east: float, suffix: str, tmp_path: Path
+) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [scale, scale, 1e-3]
+    header.vlrs.append(laspy.VLR("LASF_Projection", SYSTEMS[system][0], "", SYSTEMS[system][1]))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = torus(N).T * 1e-3 + [[east], [48.8], [0]]
+    cloud.write(path := tmp_path / f"a{suffix}")
+    if "WGS84" in system and (scale, east) == (1e-6, 9.2):
+        with pytest.raises(UnsupportedCloud, match=r"x and y are degrees.*project the points first"):
+            read_cloud(path)
+    else:
+        assert len(read_cloud(path)[0]) == N

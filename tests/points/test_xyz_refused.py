@@ -110,6 +110,10 @@ MALFORMED = {
     ),
     "degrees": (b"Lat,Lon,Alt (m)\n1,2,3\n", r"names above line 2 are of degrees.*Lat,Lon,Alt.*project"),
     "degrees in a comment": (b"# longitude latitude height\n1 2 3\n", r"names above line 2 are of degrees"),
+    "degrees with their unit": (b"gps_lat,gps_lon,alt_m\n1,2,3\n", r"names .*of degrees.*gps_lat,gps_lon"),
+    "angles": (b"range, azimuth, elevation\n1,2,3\n", r"names above line 2 are of angles: 'range, azimuth.*into x, y"),
+    "angles in a comment": (b"# Range [m] Azimuth_deg Elev. I\n1 2 3 4\n", r"names .*of angles: 'Range \[m\] Azi"),
+    "cylinders": (b"r\tphi\tz\n1 2 3\n", r"names .*of angles"),
     "fewer names than columns": (
         b"x y z\n1 2 3 4\n",
         r"line 1 names 3 columns.*'x y z'.*line 2 has 4",

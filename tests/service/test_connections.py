@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
 
+from tests.service.engines import until
+from tests.service.fakes import ObedientBackend
 from tests.service.in_process import serving
-from tests.service.test_races import CLOUD, play, willing
+from tests.service.test_races import CLOUD, POST, play, willing
 
 REFUSED = b"PUT /nowhere HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n"
 GOOD = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -29,6 +32,55 @@ def test_one_that_falls_silent_is_closed(tmp_path: Path, parts: list[bytes]) -> 
     play(scenario)
 
 
+BROKEN = {
+    b"GET /livez HTTP/1.1\r\n\r\n": "Missing mandatory Host: header",
+    b"\x16\x03\x01\x02\x00 TLS, perhaps\r\n\r\n": "illegal request line",
+    b"PUT /jobs/a HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n": "bad Content-Length",
+    b"PUT /jobs/a HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n": "illegal chunk header",
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_what_is_no_http_is_told_so_by_a_problem(
+    tmp_path: Path, broken: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(broken)
+            head, body = (await asyncio.wait_for(reader.read(), timeout=10)).split(b"\r\n\r\n")
+            problem = json.loads(body)
+            assert head.startswith(b"HTTP/1.1 400 ")
+            assert b"application/problem+json" in head
+            assert (problem["code"], problem["status"]) == ("invalid_request", 400)
+            assert problem["request_id"].encode() in head
+            assert BROKEN[broken] in problem["detail"]
+            assert not (await engine.list())[0]
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize("asked", [b"livez", b"jobs/a/events"])
+def test_what_comes_behind_an_answer_and_is_no_http_is_no_fault(
+    tmp_path: Path, asked: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(b"PUT /jobs/a?filename=a.xyz HTTP/1.1\r\nHost: [::1]\r\nContent-Length: 6\r\n\r\n1 2 3\n")
+            await reader.readuntil(b"}}")
+            writer.write(b"GET /%b HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" % asked)
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(b"zz\r\n")
+            await asyncio.wait_for(reader.read(), timeout=10)
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> None:
     async def scenario() -> None:
@@ -43,6 +95,25 @@ def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> 
             writer.write(asked)
             answer = await asyncio.wait_for(reader.read(), timeout=20)
             assert (first + answer).count(b"HTTP/1.1 20") == 2
+            writer.close()
+
+    play(scenario)
+
+
+def test_one_whose_peer_closes_half_of_it_is_taken_for_gone_and_frees_the_worker(tmp_path: Path) -> None:
+    """A peer that closed all of it sends no other sign; docs/api.md says so."""
+
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(POST)
+            await until(lambda: backend.runs)
+            writer.write_eof()
+            assert await asyncio.wait_for(reader.read(), timeout=10) == b""
+            while (await engine.list())[0]:
+                await asyncio.sleep(0.01)
             writer.close()
 
     play(scenario)

@@ -107,6 +107,26 @@ def test_a_job_is_deleted_on_a_full_disk_by_what_is_kept_for_that(server: Runnin
     server.delete_jobs()
 
 
+def test_every_job_is_deleted_on_a_disk_that_stays_full(tmp_path: Path) -> None:
+    """The reserve goes with the first, and leases are renewed meanwhile."""
+    (data := tmp_path / "data").mkdir()
+    within = (*ON_A_SMALL_DISK, str(data))
+    if subprocess.run([*within, "true"], capture_output=True).returncode:
+        pytest.skip("this machine lets us mount nothing")
+    with run_server(tmp_path, environment={"STRAIGHTPCF_MIN_FREE_BYTES": "0"}, within=within) as server:
+        server.wait_until_ready()
+        disk = Path(f"/proc/{server.process.pid}/root{data}")
+        os.kill(server.worker_pid(), signal.SIGSTOP)
+        with httpx2.Client(base_url=server.url, timeout=20) as http:
+            for number in range(10):
+                assert http.put(f"/jobs/{number}", content=b"0 0 0\n").status_code == 202
+            for number in reversed(range(10)):
+                with filled(disk):
+                    time.sleep(1)
+                    assert http.delete(f"/jobs/{number}").status_code == 204, number
+            assert not http.get("/jobs").json()["jobs"]
+
+
 def test_a_server_starts_on_a_full_disk_and_makes_room_by_what_is_over_its_time(tmp_path: Path) -> None:
     (data := tmp_path / "data").mkdir()
     holder = subprocess.Popen([*ON_A_SMALL_DISK, str(data), "sleep", "600"])  # of the disk, between two servers

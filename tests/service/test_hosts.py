@@ -91,6 +91,10 @@ def test_a_request_line_may_name_the_host_and_that_counts(tmp_path: Path, root: 
         "GET http://localhost/http://localhost/livez": b"404",
         "DELETE https://localhost/jobs/a%20b": b"404",
         "GET http://evil.example/livez": b"421",
+        "GET //livez": b"200",  # of a proxy that takes /lab off a path, and puts / before what is left
+        "GET livez": b"200",  # or /lab/ off, and puts nothing
+        "DELETE ///jobs/a%20b": b"404",
+        "OPTIONS *": b"404",
     }
 
     async def scenario() -> None:

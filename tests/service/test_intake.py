@@ -13,7 +13,7 @@ import pytest
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 from tests.service.in_process import serving
-from tests.service.rest import raw
+from tests.service.rest import curl, raw
 from tests.service.test_races import CLOUD, play, willing
 
 XYZ = noisy(torus(400), 0.01)
@@ -78,6 +78,20 @@ def test_a_packed_body_is_refused_and_not_taken_for_points(server: RunningServer
         headers = [("Content-Encoding", coding) for coding in codings]
         assert httpx2.put(url, content=bytes(1600), headers=headers).status_code == 415, codings
     assert httpx2.put(url, content=npy(), headers={"Content-Encoding": "identity"}, timeout=60).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/denoise/", "/jobs?filename="])
+@pytest.mark.parametrize("name", ["a.xyz", "a.npy"])
+def test_a_file_that_curl_took_the_line_ends_from_is_told_so(
+    server: RunningServer, path: str, name: str, tmp_path: Path
+) -> None:
+    text = "".join(f"{x} {y} {z}\n" for x, y, z in XYZ).encode()
+    (cloud := tmp_path / name).write_bytes(npy() if name == "a.npy" else text)
+    cut = curl("-d", f"@{cloud}", f"{server.url}{path}{name}")
+    assert (cut.status, cut.problem()["code"]) == (400, "invalid_request")
+    assert "--data-binary" in cut.problem()["detail"]
+    whole = curl("--data-binary", f"@{cloud}", f"{server.url}{path}{name}")
+    assert whole.status in (200, 202)
 
 
 def test_a_packed_part_of_a_form_is_refused_too(server: RunningServer) -> None:

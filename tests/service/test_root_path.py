@@ -81,5 +81,14 @@ def test_the_sdk_and_the_command_line_take_an_address_with_a_path(place: Place, 
     assert np.loadtxt(tmp_path / "b.xyz").shape == XYZ.shape
 
 
+@pytest.mark.parametrize("path", ["/docs/", "/jobs/a%20b/"])
+def test_a_slash_too_many_leads_to_the_right_path_of_the_right_host(place: Place, path: str) -> None:
+    """Of the host, the scheme and the path that a proxy shows, this server knows only what it is told."""
+    for url in (place.proxied, place.direct):
+        answer = httpx2.put(f"{url}{path}?limit=1", headers={"Host": "localhost"})
+        where = urljoin(f"{url}{path}?limit=1", answer.headers["location"])
+        assert (answer.status_code, where) == (307, f"{url}{path.rstrip('/')}?limit=1")
+
+
 def test_probes_that_pass_the_proxy_by_need_no_path(place: Place) -> None:
     assert httpx2.get(f"{place.direct}/readyz").status_code == 200

@@ -128,6 +128,51 @@ def test_a_database_that_is_deleted_or_replaced_under_a_server_loses_no_job_that
     assert not [record for record in caplog.records if record.exc_info]
 
 
+@pytest.mark.parametrize("by", ["a copy", "nothing", "one as large"])
+def test_a_database_that_is_overwritten_under_a_server_takes_no_job(
+    tmp_path: Path, by: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    database, backup = tmp_path / "data" / "jobs.sqlite3", tmp_path / "backup"
+
+    async def scenario() -> None:
+        async with asking(tmp_path / "data", ObedientBackend()) as http:
+            pass
+        shutil.copyfile(database, backup)  # as long as no server has it
+        async with asking(tmp_path / "data", ObedientBackend()) as http:
+            assert (await http.put("/jobs/before?filename=a.xyz", content=CLOUD)).status_code == 202
+            size = {"a copy": backup.stat().st_size, "nothing": 0, "one as large": database.stat().st_size}[by]
+            database.write_bytes(backup.read_bytes()[:size].ljust(size, b"\0"))
+            for _ in range(2):
+                ready = await http.get("/readyz")
+                assert (ready.status_code, ready.json()["status"]) == (503, "no_database")
+                refused = await http.put("/jobs/meanwhile?filename=a.xyz", content=CLOUD)
+                assert (refused.status_code, refused.json()["detail"]) == (503, SAID)
+
+    play(scenario)
+    assert "overwritten under this server" in caplog.text
+
+
+def test_a_database_that_servers_write_in_turns_is_their_own(tmp_path: Path) -> None:
+    """One of them moves what both have committed into the database, again and again."""
+    database = tmp_path / "data" / "jobs.sqlite3"
+
+    async def scenario() -> None:
+        async with asking(tmp_path / "data", ObedientBackend()) as http:
+            written = set()
+            with closing(sqlite3.connect(database, isolation_level=None)) as other:
+                for number in range(60):
+                    made = await http.put(f"/jobs/{number}?filename=a.xyz", content=CLOUD)
+                    assert made.status_code == 202, made.text
+                    other.execute("UPDATE jobs SET name = ? WHERE id = ?", ("a" * 20_000, str(number)))
+                    if number % 3 == 0:
+                        other.execute(f"PRAGMA wal_checkpoint({('PASSIVE', 'FULL', 'TRUNCATE')[number // 3 % 3]})")
+                    assert (await http.get("/readyz")).status_code == 200
+                    written.add(database.stat().st_mtime_ns)
+            assert len(written) > 10
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("part", ["-wal", "-shm"])
 def test_what_was_committed_outlives_a_wal_or_shm_that_is_deleted_under_its_server(tmp_path: Path, part: str) -> None:
     async def scenario() -> None:

@@ -18,6 +18,10 @@ const POSITIONS = [
   ["0", "1", "2"],
 ];
 const DEGREES = [["lat", "latitude"], ["lon", "lng", "long", "longitude"]];
+const POLAR = [
+  ["azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"],
+  ["range", "distance", "dist", "radius", "r", "rho", "elevation", "elev", "el", "zenith", "inclination"],
+];
 const UNIT = /\s*(\[.*\]|\(.*\))$/;
 const BEFORE_UNIT = /(?<!\s)\s+(?=[[(])/g;
 const LEAD = /^[^,;\t:]*:\s+/; // columns: x y z
@@ -178,17 +182,17 @@ function layout(line, names, remarks, marks) {
     const fitting = meant(title, marks).map((labels) => fitted(labels, cells)).filter((labels) => labels !== null);
     const axes = fitting.map(axesOf).find((found) => found !== null);
     if (axes) return { delimiter, axes, isNamed: true };
-    if (fitting.some(areDegrees)) throw new Error(UNKNOWN_NAMES);
+    if (fitting.some((labels) => hold(DEGREES, labels) || hold(POLAR, labels))) throw new Error(UNKNOWN_NAMES);
     const isRefused = fitting.length > 0 || meant(title, marks).some((labels) => axesOf(labels) !== null);
     if (title && title === names && cells.length > 3 && isRefused) throw new Error(UNKNOWN_NAMES);
   }
   return { delimiter, axes: [0, 1, 2], isNamed: false };
 }
 
-// No distance can be told in latitude and longitude.
-function areDegrees(labels) {
-  const plain = labels.map((label) => label.replace(UNIT, "").toLowerCase());
-  return DEGREES.every((names) => names.some((name) => plain.includes(name)));
+// No distance can be told in latitude and longitude, nor in azimuth and elevation: whether something of every set is there.
+function hold(sets, labels) {
+  const plain = labels.flatMap((label) => label.replace(UNIT, "").toLowerCase().split(/[^a-z]+/));
+  return sets.every((names) => names.some((name) => plain.includes(name)));
 }
 
 // The names in a title as they may be meant: `x [m]` as one, `Point Id` between tabs, `columns: x y z`.
