@@ -55,6 +55,8 @@ async def receive_upload(request: Request, target: Path) -> Upload:
     coding = ",".join(request.headers.getlist("content-encoding"))
     if any(each.strip().lower() not in ("", "identity") for each in coding.split(",")):
         raise UnknownFormat(f"the body is encoded as {coding[:40]!r}; send it as it is")
+    if (part := request.headers.get("content-range")) is not None:  # RFC 9110, 14.5
+        raise InvalidRequest(f"the body is {part[:60]!r} of a file (Content-Range); send the whole of it")
     engine: Engine = request.app.state.engine
     return await in_time(engine, _receive(request, target, engine))
 

@@ -80,6 +80,16 @@ def test_a_packed_body_is_refused_and_not_taken_for_points(server: RunningServer
     assert httpx2.put(url, content=npy(), headers={"Content-Encoding": "identity"}, timeout=60).status_code == 200
 
 
+@pytest.mark.parametrize("path", ["/denoise/a.xyz", "/jobs/part?filename=a.xyz"])
+def test_a_part_of_a_file_is_not_taken_for_the_whole(server: RunningServer, path: str, tmp_path: Path) -> None:
+    """What `curl -C 1000 -T` sends to go on with an upload."""
+    (cloud := tmp_path / "a.xyz").write_bytes(b"0.5 0.25 1\n" * 400)
+    answer = curl("-C", "1100", "-T", cloud, f"{server.url}{path}")
+    assert (answer.status, answer.problem()["code"]) == (400, "invalid_request")
+    assert "'bytes 1100-4399/4400'" in answer.problem()["detail"]
+    assert not httpx2.get(f"{server.url}/jobs").json()["jobs"]
+
+
 @pytest.mark.parametrize("path", ["/denoise/", "/jobs?filename="])
 @pytest.mark.parametrize("name", ["a.xyz", "a.npy"])
 def test_a_file_that_curl_took_the_line_ends_from_is_told_so(
