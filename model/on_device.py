@@ -142,7 +142,7 @@ class OnDevice:
         heard: _Heard | None = None
         if agree:
             with current(self.device), enough_memory(self.device, len(positions)):
-                heard = _Heard(sent)
+                heard = _Heard(len(points), sent)
             for some in self._batched(cut, partial(self._hear, points, sent, heard)):
                 yield from [None] * some
         waiting: deque[tuple[range, _Result]] = deque()
@@ -291,10 +291,10 @@ class _DeviceCut:
 class _Heard:
     """What the patches of a cut said in their first evaluation, on the device."""
 
-    def __init__(self, sent: _DeviceCut) -> None:
-        """Make place for all patches."""
+    def __init__(self, count: int, sent: _DeviceCut) -> None:
+        """Make place for all patches of a cloud of `count` points."""
         patches, points = sent.index.shape
-        self._agreement = Agreement(sent.index, sent.scales, sent.radii)
+        self._agreement = Agreement(count, sent.index, sent.scales, sent.radii)
         self._said = torch.empty(patches, points + 1, 3, dtype=torch.float32, device=sent.index.device)
 
     def add(self, some: slice, x: torch.Tensor, said: torch.Tensor) -> None:

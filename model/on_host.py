@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -36,15 +37,17 @@ class OnHost:
         """Evaluate few patches ahead, so that a slow reader does not fill the memory."""
         points = torch.from_numpy(positions)
         parts = (torch.from_numpy(part) for part in (cut.index, scales, cut.radii))
-        agreement = Agreement(*parts) if agree else None
-        heard: list[tuple[torch.Tensor, torch.Tensor]] = []  # of each patch its first velocities, and d
+        agreement = Agreement(len(points), *parts) if agree else None
+        heard: list[tuple[torch.Tensor, torch.Tensor]] = []  # of each patch its own points' first velocities, and d
 
         def known(patch: int) -> torch.Tensor | None:
             return torch.tensor([[known_distances[patch]]]) if patch in known_distances else None
 
-        def begin(patch: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        def begin(joined: Agreement, patch: int) -> tuple[torch.Tensor, ...]:
             x, distance = _cut_out(points, cut, scales, patch), known(patch)
-            return x, self._network.begin(x), self._network.distance(x) if distance is None else distance
+            velocities, distance = self._network.begin(x), self._network.distance(x) if distance is None else distance
+            weighed = joined.weighed(slice(patch, patch + 1), x, velocities, distance)
+            return *weighed, velocities[:, : max(1, int(cut.owned[patch]))].clone(), distance
 
         def move(patch: int) -> _T:
             x, owned = _cut_out(points, cut, scales, patch), int(cut.owned[patch])
@@ -57,8 +60,8 @@ class OnHost:
 
         every = range(len(cut.seeds))
         if agreement is not None:
-            for patch, (x, velocities, distance) in zip(every, self.mapper(begin, every), strict=True):
-                agreement.add(slice(patch, patch + 1), x, velocities, distance)
+            for places, said, velocities, distance in self.mapper(partial(begin, agreement), every):
+                agreement.add_weighed(places, said)
                 heard.append((velocities, distance))
                 yield None
         yield from self.mapper(move, every)

@@ -17,7 +17,8 @@ __all__ = ["Finish", "First", "Floats", "Mapper", "Network", "Processor", "cut_o
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
 Floats = npt.NDArray[np.float64]
-First = tuple[torch.Tensor, torch.Tensor]  # velocities (B, P, 3) of the first evaluation, and what takes their place
+# Velocities of the first evaluation, of as many points as are asked for or more, and what takes their place, (B, P, 3).
+First = tuple[torch.Tensor, torch.Tensor]
 Finish = Callable[[int, Floats], _T]  # a patch's number and how far its points move -> what is made of it
 
 

@@ -86,22 +86,22 @@ class StraightPCF(nn.Module):
         that of the last of the first full_evaluations. The flow is straight (section 4.2), so that hardly changes
         what is seen of them (docs/kernels.md has the figures). turns: (T, 3, 3) rotations, one after the other for the
         evaluations: the network's errors depend on how a patch lies, and those of several positions average out.
-        first: the first evaluation's velocities (B, P, 3), made before (`first_velocities`), and what takes their place
-        (B, P, 3): by how much that differs, so much, times `_AGREED_SHARE`, is added to those of the later ones.
+        first: the first evaluation's velocities of `rows` points or more, made before (`first_velocities`), and what
+        takes their place (B, P, 3): `_AGREED_SHARE` of the difference is added to the `rows` points' later velocities.
         """
         distance = self.distance_module(x) if distance is None else distance
         step = distance[:, :, None] / (euler_steps * len(self.velocity_modules))
         evaluations = [velocity for _ in range(euler_steps) for velocity in self.velocity_modules]
         moving = torch.zeros_like(x)
         inside = None if owned is None else torch.arange(rows or x.shape[1], device=x.device) < owned[:, None]
-        differs = None if first is None else _AGREED_SHARE * (first[1] - first[0])
+        differs = None if first is None else _AGREED_SHARE * (first[1][:, :rows] - first[0][:, :rows])
 
         def velocities(number: int, x: torch.Tensor, rows: int | None) -> torch.Tensor:
             if first is not None and number == 0:
                 return first[1][:, :rows]
             turn = None if turns is None else turns[number % len(turns)]
             found = _turned(evaluations[number], x, rows, turn)
-            return found if differs is None else found + differs[:, :rows]
+            return found if differs is None or rows is None else found + differs
 
         last = len(evaluations) - 1
         for done in range(last):

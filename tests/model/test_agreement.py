@@ -25,7 +25,7 @@ def network() -> StraightPCF:
 
 
 def test_what_is_nearer_to_its_seed_counts_for_more() -> None:
-    agreement = Agreement(torch.tensor([[4, 7], [7, 9]]), torch.tensor([1.0, 2.0]), torch.tensor([1.0, 0.5]))
+    agreement = Agreement(12, torch.tensor([[4, 7], [7, 9]]), torch.tensor([1.0, 2.0]), torch.tensor([1.0, 0.5]))
     x = torch.tensor([[[0.0, 0, 0], [0, 0.5, 0]], [[0, 0, 0], [0, 0, 1]]])
     velocities = torch.tensor([[[1.0, 0, 0], [2, 0, 0]], [[4, 0, 0], [8, 0, 0]]])
     distance = torch.tensor([[0.5], [0.25]])
@@ -43,7 +43,7 @@ def test_the_order_in_which_patches_are_heard_changes_no_bit() -> None:
     index = torch.stack([torch.randperm(90, generator=rng)[:60] for _ in range(12)])
     x, velocities = torch.rand(12, 60, 3, generator=rng), torch.rand(12, 60, 3, generator=rng)
     distance, scales = torch.rand(12, 1, generator=rng), torch.ones(12)
-    one, other = Agreement(index, scales, scales), Agreement(index, scales, scales)
+    one, other = (Agreement(90, index, scales, scales) for _ in range(2))
     one.add(slice(0, 12), x, velocities, distance)
     for patch in reversed(range(12)):
         some = slice(patch, patch + 1)
@@ -52,7 +52,7 @@ def test_the_order_in_which_patches_are_heard_changes_no_bit() -> None:
 
 
 def test_where_there_is_nowhere_to_go_nothing_is_divided_by_nothing() -> None:
-    agreement = Agreement(torch.tensor([[0, 1]]), torch.ones(1), torch.zeros(1))  # all points in one place, d = 0
+    agreement = Agreement(2, torch.tensor([[0, 1]]), torch.ones(1), torch.zeros(1))  # all points in one place, d = 0
     agreement.add(slice(0, 1), torch.zeros(1, 2, 3), torch.ones(1, 2, 3), torch.zeros(1, 1))
     torch.testing.assert_close(
         agreement.velocities(slice(0, 1), torch.zeros(1, 1)), torch.ones(1, 2, 3), rtol=1e-4, atol=0

@@ -81,9 +81,7 @@ def test_the_network_of_a_pass_can_be_captured(*, read_before: bool) -> None:
 
 @pytest.mark.parametrize("known_distances", [{}, dict.fromkeys(range(40), 0.5)])
 @pytest.mark.parametrize("agree", [False, True])
-def test_a_batch_waits_for_nothing(
-    known_distances: dict[int, float], *, agree: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_waits_for_nothing(known_distances: dict[int, float], *, agree: bool) -> None:
     network, captured = on_device().requires_grad_(requires_grad=False), []
     model = Filter(network, device="meta", threads=1)
 
@@ -91,16 +89,12 @@ def test_a_batch_waits_for_nothing(
         captured.append(run)
         return run, run()
 
-    def place(index: torch.Tensor, *, return_inverse: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        return index.flatten()[:5000], index.long()  # once for a cut this waits
-
-    monkeypatch.setattr(torch, "unique", place)
     rows, each = np.arange(40), np.ones(40)
     cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
     processor = OnDevice(model, "meta", batch=8, capture=capture)
     points = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE)
     sent = _DeviceCut.of(cut, each, known_distances, DEVICE)
-    heard = _Heard(sent) if agree else None
+    heard = _Heard(5000, sent) if agree else None
     with OnCuda(), Captured():
         for first in range(0, 40, 8):
             if heard is not None:
