@@ -6,8 +6,9 @@ import torch
 
 __all__ = ["Agreement"]
 
-# Near its rim a patch lacks neighbours: what it says of a point there counts for less, and for this at least.
-_SHARPNESS, _LEAST_WEIGHT = 2.0, 1e-3
+# Near its rim a patch lacks neighbours: what it says of a point counts by a power of how near to the seed that is, from
+# 1 there to the least at the rim.
+_SHARPNESS, _LEAST_NEARNESS = 2.0, 1e-3
 _LEAST_DISTANCE = 1e-6  # bounds a division; the step that comes of it is as small
 # Sums are of integers, so that the order in which patches come, and on a device threads, changes nothing.
 _STEPS = 2.0**40  # of the unit ball's radius
@@ -40,7 +41,7 @@ class Agreement:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return what `add_weighed` takes, of what `add` takes; on any thread."""
         from_seed = torch.linalg.vector_norm(x.double(), dim=2) / self._reach[patches]
-        weight = (1 - from_seed.nan_to_num()).clamp(min=_LEAST_WEIGHT).pow(_SHARPNESS)[:, :, None]
+        weight = (1 - from_seed.nan_to_num()).clamp(min=_LEAST_NEARNESS).pow(_SHARPNESS)[:, :, None]
         steps = _bounded(distance) * velocities / self._scales[patches]
         said = torch.cat([weight * steps, weight], dim=2)
         return self._places(patches).flatten(), (_STEPS * said).round().long().flatten(0, 1)

@@ -35,7 +35,7 @@ _T = TypeVar("_T")
 # A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
 Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
 
-Compute = Callable[..., torch.Tensor]  # of a count of rows and tensors, of patches in each row
+Compute = Callable[..., torch.Tensor]  # how many of a patch's points, and tensors (B, ...) -> what is made of them
 _Key = tuple[int, int, int]  # patches, rows, tensors
 _BATCH = 32
 _ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
