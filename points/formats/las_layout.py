@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass
 from typing import Any
@@ -32,9 +33,14 @@ EXTRA_BYTES_ID = (b"LASF_Spec", 4)
 COPC_ID = (b"copc", 1)
 _GEO_KEYS_ID, _WKT_ID = (b"LASF_Projection", 34735), (b"LASF_Projection", 2112)
 _GEOGRAPHIC = (1024, 0, 1, 2)  # GTModelTypeGeoKey, its value in place, one of them: latitude and longitude
-_OTHER_SYSTEMS = (b"PROJCS[", b"PROJCRS[", b"GEOCCS[", b"LOCAL_CS[", b"ENGCRS[")
+# What a text of a reference system (WKT, of 2001 and of 2019) says of the kind that it is, in any case and with spaces.
+_OTHER_SYSTEMS = re.compile(
+    rb"(PROJ(CS|CRS|ECTEDCRS)|GEOCCS|LOCAL_CS|ENG(INEERING)?CRS|CARTESIAN)\s*[\[(,]", re.IGNORECASE
+)
+_GEOGRAPHIC_SYSTEMS = re.compile(rb"(GEOG(CS|CRS|RAPHICCRS)|GEOD(ETIC)?CRS)\s*[\[(]", re.IGNORECASE)
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
-_RECORD_BYTES = 54
+_RECORD_BYTES, _EXTENDED_BYTES = 54, 60
+_MOST_EXTENDED = 10_000  # that are looked at: a broken count may be any
 _EXTRA_STRUCT_BYTES = 192
 _HAS_SCALE, _HAS_OFFSET = 0x08, 0x10  # bits of its options
 _EXTRA_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
@@ -109,6 +115,7 @@ class LasHeader:
 
     head: the public header as it stands.  gap: what stands between the last record and the points.
     first_extended: byte offset of the first extended record, or of waveform data, or None.
+    wkt: the text of the reference system, of a record or an extended one; empty without.
     """
 
     minor: int
@@ -123,6 +130,7 @@ class LasHeader:
     scales: npt.NDArray[np.float64]
     offsets: npt.NDArray[np.float64]
     first_extended: int | None
+    wkt: bytes
 
     def record(self, user_id: bytes, record_id: int) -> LasRecord | None:
         """Return the first record of an identity."""
@@ -161,7 +169,7 @@ def read_header(raw: bytes) -> LasHeader:
     records, end = _records(raw, size, count, begin)
     header = LasHeader(
         minor, raw[:size], records, raw[end:begin], point_format, bool(kind & 0x80), row_bytes, points, begin,
-        scales, offsets, _first_extended(raw, minor, begin),
+        scales, offsets, _first_extended(raw, minor, begin), _wkt(raw, minor, records),
     )  # fmt: skip
     if header.record(*COPC_ID) is not None:
         raise UnsupportedCloud("a COPC file is indexed by position, which cannot be kept: convert it to LAZ first")
@@ -170,11 +178,11 @@ def read_header(raw: bytes) -> LasHeader:
 
 def is_geographic(header: LasHeader) -> bool:
     """Tell whether a record says that x and y are longitude and latitude."""
-    keys, wkt = header.record(*_GEO_KEYS_ID), header.record(*_WKT_ID)
-    if wkt is not None and any(system in wkt.data for system in _OTHER_SYSTEMS):
+    if _OTHER_SYSTEMS.search(header.wkt) is not None:
         return False
-    if wkt is not None and (b"GEOGCS[" in wkt.data or b"GEOGCRS[" in wkt.data):
+    if _GEOGRAPHIC_SYSTEMS.search(header.wkt) is not None:
         return True
+    keys = header.record(*_GEO_KEYS_ID)
     data = keys.data if keys is not None else b""
     return _GEOGRAPHIC in struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
 
@@ -192,6 +200,23 @@ def _records(raw: bytes, at: int, count: int, limit: int) -> tuple[tuple[LasReco
     if at > limit:
         raise MalformedFile(f"the LAS point data offset {limit} lies within the header, which ends at byte {at}")
     return tuple(records), at
+
+
+def _wkt(raw: bytes, minor: int, records: tuple[LasRecord, ...]) -> bytes:
+    """Return the text of the reference system; what is broken of extended records, which are only kept, ends them."""
+    found = next((record.data for record in records if (record.user_id, record.record_id) == _WKT_ID), None)
+    if found is not None or minor < 4:
+        return found or b""
+    at, count = struct.unpack_from("<QI", raw, 235)
+    for _ in range(min(count, _MOST_EXTENDED)):
+        if at + _EXTENDED_BYTES > len(raw):
+            break
+        user_id, record_id, length = struct.unpack_from("<2x16sHQ", raw, at)
+        at += _EXTENDED_BYTES
+        if (user_id.split(b"\0")[0], record_id) == _WKT_ID:
+            return raw[at : at + length]
+        at += length
+    return b""
 
 
 def _first_extended(raw: bytes, minor: int, begin: int) -> int | None:

@@ -310,6 +310,9 @@ SYSTEMS = {
     "WGS84": (2112, WGS84),
     "WGS84 and heights": (2112, b'COMPD_CS["a",' + WGS84 + b',VERT_CS["b"]]'),
     "WGS84 of 2019": (2112, b'GEOGCRS["WGS 84",CS[ellipsoidal,2]]'),
+    "WGS84, spelt otherwise": (2112, WGS84.replace(b"GEOGCS[", b"geogcs [")),
+    "WGS84, of a geodetic system": (2112, b'GEODCRS["WGS 84",CS[ellipsoidal,2]]'),
+    "geocentric": (2112, b'GEODCRS["WGS 84",CS[Cartesian,3]]'),
     "UTM": (2112, UTM),
     "keys of WGS84": (34735, struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 2, 2048, 0, 1, 4326)),
     "keys of UTM": (34735, struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 32632)),
@@ -318,14 +321,20 @@ SYSTEMS = {
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("is_extended", [False, True])
 @pytest.mark.parametrize("system", SYSTEMS)
 @pytest.mark.parametrize(("scale", "east"), [(1e-6, 9.2), (1e-6, 400.0), (1e-3, 9.2)])
 def test_longitude_and_latitude_are_refused_where_a_record_and_the_numbers_say_so(
-    system: str, scale: float, east: float, suffix: str, tmp_path: Path
+    system: str, scale: float, east: float, is_extended: bool, suffix: str, tmp_path: Path
 ) -> None:
+    number, said = SYSTEMS[system]
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = [scale, scale, 1e-3]
-    header.vlrs.append(laspy.VLR("LASF_Projection", SYSTEMS[system][0], "", SYSTEMS[system][1]))
+    if is_extended and number == 2112:  # the keys of before 1.4 are in no extended record
+        header.evlrs = laspy.vlrs.vlrlist.VLRList()
+        header.evlrs += [laspy.VLR("straightpcf", 1, "", b"before"), laspy.VLR("LASF_Projection", number, "", said)]
+    else:
+        header.vlrs.append(laspy.VLR("LASF_Projection", number, "", said))
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = torus(N).T * 1e-3 + [[east], [48.8], [0]]
     cloud.write(path := tmp_path / f"a{suffix}")
