@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import uvicorn
 from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
-from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -25,6 +24,7 @@ import straightpcf
 from straightpcf.points.errors import InvalidOptions, MissingDependency
 from straightpcf.service.admission import Limits
 from straightpcf.service.api.auth import Gate, owner_of
+from straightpcf.service.api.cors import CorsMiddleware
 from straightpcf.service.api.errors import install_error_handlers
 from straightpcf.service.api.hosts import HostMiddleware, is_loopback
 from straightpcf.service.api.intake import Coming
@@ -96,9 +96,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)
     if origins:
-        app.add_middleware(
-            CORSMiddleware, allow_origins=origins, allow_methods=["*"], allow_headers=["*"], expose_headers=["*"]
-        )
+        app.add_middleware(CorsMiddleware, origins=origins)
     app.add_middleware(TargetMiddleware)
     install_error_handlers(app)
     app.include_router(router)

@@ -19,6 +19,7 @@ import pytest
 from straightpcf.points.wire.patches import PatchReader
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, run_server
+from tests.service.rest import curl
 
 
 @pytest.fixture(scope="module")
@@ -342,6 +343,12 @@ def test_pages_of_other_origins_may_call_only_where_the_operator_says_so(server:
         other.wait_until_ready()
         assert allowed(other.url, friend) == friend
         assert allowed(other.url, stranger) is None
+        asks = ["-X", "OPTIONS", "-H", "Access-Control-Request-Method: POST", f"{other.url}/denoise"]
+        refused = curl("-H", f"Origin: {stranger}", *asks)
+        assert (refused.status, refused.problem()["code"]) == (403, "cross_origin")
+        assert stranger in refused.problem()["detail"]
+        from_outside = ["-H", f"Origin: {friend}", "-H", "Access-Control-Request-Private-Network: true"]
+        assert curl(*from_outside, *asks).headers["access-control-allow-private-network"] == "true"
 
 
 def test_events_pass_proxies_at_once_and_the_trace_reaches_the_log(server: RunningServer, http: httpx2.Client) -> None:
