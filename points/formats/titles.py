@@ -36,6 +36,7 @@ _POLAR = (
     {"azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"},
     {"range", "distance", "dist", "radius", "r", "rho", "elevation", "elev", "el", "zenith", "inclination"},
 )
+_VALUE = re.compile(r"[-+.]?\d")  # how a word begins that is none of column names of these kinds
 _NO_LETTERS = re.compile(r"[^a-z]+")
 _UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
@@ -141,7 +142,12 @@ def _refuse(names: Title | None, line: int, columns: int, marks: Sequence[bytes]
 
 
 def _hold(sets: Sequence[set[str]], words: Sequence[str]) -> bool:
-    """Tell whether something of every set is among names such as `lat`, `gps_lon` and `Range [m]`."""
+    """Tell whether something of every set is among names such as `lat`, `gps_lon` and `Range [m]`.
+
+    `lat 48.1 long 9.2`, where a scanner stood, is none of names.
+    """
+    if any(map(_VALUE.match, words)):
+        return False
     plain = {part for word in words for part in _NO_LETTERS.split(_UNIT.sub("", word).lower())}
     return all(plain & names for names in sets)
 

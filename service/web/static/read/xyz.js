@@ -17,6 +17,7 @@ const POSITIONS = [
   ["x1", "y1", "z1"],
   ["0", "1", "2"],
 ];
+const VALUE = /^[-+.]?\d/;
 const DEGREES = [["lat", "latitude"], ["lon", "lng", "long", "longitude"]];
 const POLAR = [
   ["azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"],
@@ -190,7 +191,9 @@ function layout(line, names, remarks, marks) {
 }
 
 // No distance can be told in latitude and longitude, nor in azimuth and elevation: whether something of every set is there.
+// `lat 48.1 long 9.2`, where a scanner stood, is none of names.
 function hold(sets, labels) {
+  if (labels.some((label) => VALUE.test(label))) return false;
   const plain = labels.flatMap((label) => label.replace(UNIT, "").toLowerCase().split(/[^a-z]+/));
   return sets.every((names) => names.some((name) => plain.includes(name)));
 }
