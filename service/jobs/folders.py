@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -21,6 +22,9 @@ __all__ = ["INPUT", "JobFolders", "digest_of"]
 INPUT = "input"
 _MODE = 0o700  # other users of the machine have no key either
 _ORPHAN_SECONDS = 3600.0  # an upload, folder or lock that nobody owns is given up after this
+# What is called otherwise is no server's: a data directory may be a folder that had a `jobs` of its own.
+_OURS = re.compile(r"[0-9a-f]{32}")  # folders and locks
+_UPLOAD = re.compile(r"tmp\w{8}")  # as mkstemp calls them
 
 
 class JobFolders:
@@ -109,13 +113,14 @@ class JobFolders:
     def orphans(self) -> list[str]:
         """Name job folders that are old enough to have been committed, and drop uploads that nobody finished."""
         for upload in _old_in(self._incoming):
-            if upload.is_file() and not _is_locked(upload):  # a folder is none of ours
+            if _UPLOAD.fullmatch(upload.name) and upload.is_file() and not _is_locked(upload):
                 upload.unlink(missing_ok=True)
-        return [folder.name for folder in _old_in(self._jobs)]
+        return [folder.name for folder in _old_in(self._jobs) if _OURS.fullmatch(folder.name)]
 
     def _old_locks(self) -> list[str]:
         """Name the servers that began so long ago that they hold their locks if they live."""
-        return [path.stem for path in _old_in(self._servers) if path.suffix == ".lock"]
+        old = _old_in(self._servers)
+        return [path.stem for path in old if path.suffix == ".lock" and _OURS.fullmatch(path.stem)]
 
     def _lock_path(self, server: str) -> Path:
         return self._servers / f"{server}.lock"

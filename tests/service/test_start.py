@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import subprocess
 import sys
+import uuid
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -60,3 +62,18 @@ def test_a_first_sweep_that_fails_is_made_up_for_by_the_next(tmp_path: Path, mon
 def test_a_server_whose_stdout_is_closed_starts(tmp_path: Path) -> None:
     with run_server(tmp_path, within=("/bin/sh", "-c", 'exec "$@" >&-', "sh")) as server:
         assert server._status("/livez") == 200
+
+
+def test_what_others_have_in_a_data_directory_stays_there(tmp_path: Path) -> None:
+    """A folder of a project, say, that had `jobs` of its own before."""
+    theirs = [tmp_path / "data" / name for name in ("jobs/2024/report.txt", "incoming/letter.txt", "servers/www.lock")]
+    ours = tmp_path / "data" / "jobs" / uuid.uuid4().hex / "input"
+    for path in (*theirs, ours):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("kept")
+    for path in (tmp_path / "data").glob("*/*"):
+        os.utime(path, (0, 0))
+    with run_server(tmp_path) as server:  # which sweeps before it listens
+        assert server._status("/livez") == 200
+        assert [path.read_text() for path in theirs] == ["kept"] * len(theirs)
+        assert not ours.exists()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import tempfile
 import time
+import uuid
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -48,27 +50,31 @@ def test_a_fence_is_void_for_every_later_job_of_its_id_too(tmp_path: Path) -> No
 def test_the_locks_of_dead_servers_are_removed_also_of_those_that_held_no_job(tmp_path: Path) -> None:
     locks = tmp_path / "servers"
     with closing(JobFolders(tmp_path)) as ours, closing(JobFolders(tmp_path)) as other:
-        for name in ("dead", "dead-with-jobs", "just-begun"):
+        dead, with_jobs, begun, foreign = *(uuid.uuid4().hex for _ in range(3)), "printer"
+        for name in (dead, with_jobs, begun, foreign):
             (locks / f"{name}.lock").touch()
         for path in locks.iterdir():
-            if path.stem != "just-begun":  # which may be about to lock it
+            if path.stem != begun:  # which may be about to lock it
                 os.utime(path, (LONG_AGO, LONG_AGO))
-        assert ours.dead_servers({"dead-with-jobs", other.server}) == ["dead-with-jobs"]
-        assert {path.stem for path in locks.iterdir()} == {ours.server, other.server, "just-begun"}
+        assert ours.dead_servers({with_jobs, other.server}) == [with_jobs]
+        assert {path.stem for path in locks.iterdir()} == {ours.server, other.server, begun, foreign}
 
 
-def test_an_upload_that_nobody_finished_is_dropped_and_a_folder_beside_it_is_let_be(tmp_path: Path) -> None:
+def test_an_upload_that_nobody_finished_is_dropped_and_what_is_of_others_is_let_be(tmp_path: Path) -> None:
     with closing(JobFolders(tmp_path)) as folders:
-        (tmp_path / "incoming" / "folder").mkdir()
-        (tmp_path / "incoming" / "upload").touch()
-        (tmp_path / "jobs" / "job").mkdir()
-        for path in (*(tmp_path / "incoming").iterdir(), tmp_path / "jobs" / "job"):
+        incoming, jobs = tmp_path / "incoming", tmp_path / "jobs"
+        (incoming / "folder").mkdir()
+        (incoming / "letter.txt").touch()
+        os.close(tempfile.mkstemp(dir=incoming)[0])
+        (jobs / "2024").mkdir()
+        (jobs / (job := uuid.uuid4().hex)).mkdir()
+        for path in (*incoming.iterdir(), *jobs.iterdir()):
             os.utime(path, (LONG_AGO, LONG_AGO))
         with folders.upload() as sending:  # slowly: longer than an upload that nobody owns is kept
             os.utime(sending, (0, 0))
-            assert folders.orphans() == ["job"]
+            assert folders.orphans() == [job]
             assert sending.exists()
-        assert [path.name for path in (tmp_path / "incoming").iterdir()] == ["folder"]
+        assert {path.name for path in incoming.iterdir()} == {"folder", "letter.txt"}
 
 
 def test_a_store_that_is_opened_again_is_not_written_to(tmp_path: Path) -> None:
