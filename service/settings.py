@@ -118,7 +118,7 @@ class Settings:
             raise InvalidOptions("api_keys holds no key; leave it out for a server that asks for none")
         if self.api_keys_file is not None:
             try:
-                lines = self.api_keys_file.read_text().splitlines()
+                lines = self.api_keys_file.read_text(encoding="utf-8-sig").splitlines()  # as Notepad saves it, too
             except (OSError, UnicodeDecodeError) as exc:
                 raise InvalidOptions(f"api_keys_file {self.api_keys_file}: {exc}") from exc
             lines = [line for line in lines if not line.lstrip().startswith("#")]

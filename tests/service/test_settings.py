@@ -100,6 +100,12 @@ def test_a_hash_begins_a_comment_in_a_file_alone(tmp_path: Path) -> None:
     assert Settings(api_keys="#alpha", api_keys_file=path).keys() == ("#alpha", "gamma#1")
 
 
+@pytest.mark.parametrize("text", ["alpha\r\nbeta\r\n", "# die Schlüssel\r\nalpha\r\nbeta"])
+def test_a_file_of_keys_may_be_one_that_windows_saved(text: str, tmp_path: Path) -> None:
+    (path := tmp_path / "keys").write_bytes(text.encode("utf-8-sig"))
+    assert Settings(api_keys_file=path).keys() == ("alpha", "beta")
+
+
 @pytest.mark.parametrize("value", [",", " , ,"])
 def test_keys_that_are_set_but_hold_none_open_no_server(value: str, tmp_path: Path) -> None:
     (path := tmp_path / "keys").write_text("alpha\n")
