@@ -10,7 +10,7 @@ from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.text import shown
 
-__all__ = ["MARKS", "MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "words_of"]
+__all__ = ["MARKS", "MAX_COLUMNS", "Title", "delimiter_of", "named_columns", "names_axes", "words_of"]
 
 MAX_COLUMNS = 4096
 MARKS = (b";", b",")  # what may stand between cells where it is not white space: the first that a row has
@@ -80,6 +80,12 @@ def named_columns(
         if title is names and columns > 3:  # a remark may be any text
             _refuse(title, line, columns, marks, fits=bool(fitting))
     return tuple(labels), None
+
+
+def names_axes(text: bytes, *, marks: Sequence[bytes] = MARKS) -> bool:
+    """Tell whether a line names x, y and z in words, whatever else it names: 450 and 550, of wavelengths."""
+    ways = _meant(Title(0, text), MAX_COLUMNS, marks)
+    return any((axes := _axes(words)) is not None and not words[axes[0]].isdigit() for words in ways)
 
 
 def delimiter_of(row: bytes, marks: Sequence[bytes] = MARKS) -> bytes | None:

@@ -11,7 +11,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.colours import RGB
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.text import as_number, is_missing, shown
-from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, words_of
+from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, names_axes, words_of
 
 __all__ = ["PTS_COLUMNS", "Layout", "read_layout"]
 
@@ -102,7 +102,9 @@ def _described(
 def _are_names(text: bytes, marks: Sequence[bytes]) -> bool:
     words = words_of(text, marks=marks)
     has_gaps = delimiter_of(text, marks) is not None and all(is_missing(word) for word in words)
-    return len(words) >= 3 and not has_gaps and not any(_is_number(word) for word in words)
+    if not 3 <= len(words) <= MAX_COLUMNS or has_gaps:
+        return False
+    return not any(_is_number(word) for word in words) or names_axes(text, marks=marks)
 
 
 def _are_numbered(text: bytes, following: bytes, marks: Sequence[bytes]) -> bool:

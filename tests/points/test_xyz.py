@@ -57,6 +57,8 @@ TABLES = {
     "Ouster's names": b"RANGE (mm),X1 (mm),Y1 (mm),Z1 (mm)\n7,1,2,3\n7,4,5,6\n",
     "pandas' numbers": b"0,1,2\n1.0,2.0,3.0\n4.0,5,6.0\n",
     "pandas' numbers and index": b",0,1,2,3\r\n0,1.0,2.0,3.0,7\r\n1,4.0,5,6.0,7\r\n",
+    "names of wavelengths": b"id,X,Y,Z,450,550.5,inf\n7,1,2,3,8,9,10\n7,4,5,6,8,9,10\n",
+    "names of wavelengths between spaces": b"x [m] y [m] z [m] 450 550\n1 2 3 8 9\n4 5 6 8 9\n",
     "MATLAB's comment": b"%id x y z\n7 1 2 3\n8 4 5 6\n",
     "names that begin with digits": b"1st,x,y,z\n7,1,2,3\n8,4,5,6\n",
     "a delimiter behind the cells": b"id,x,y,z\n7,1,2,3,\n8,4,5,6,\n",

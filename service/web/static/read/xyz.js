@@ -263,7 +263,13 @@ function byQuotes(line) {
 function areNames(line, marks) {
   const labels = words(line, marks);
   const hasGaps = delimiterOf(line, marks) && labels.every((label) => MISSING.includes(label.toLowerCase()));
-  return labels.length >= 3 && !hasGaps && !labels.some((label) => NUMBER.test(label));
+  if (labels.length < 3 || hasGaps) return false;
+  return !labels.some((label) => NUMBER.test(label)) || namesAxes(line, marks);
+}
+
+// Whether a line names x, y and z in words, whatever else it names: 450 and 550, of wavelengths.
+function namesAxes(line, marks) {
+  return meant(line, marks).some((labels) => axesOf(labels) && !/^\d+$/.test(labels[axesOf(labels)[0]]));
 }
 
 // 0, 1, 2..., behind the empty name of an index perhaps.
