@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.scalars import scalar_columns
 
-__all__ = ["TYPES", "check_new", "new_las"]
+__all__ = ["TYPES", "check_new", "new_las", "renamed"]
 
 FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
@@ -32,13 +32,20 @@ def check_new(cloud: PointCloud) -> None:
     _laid_out(cloud)
 
 
+def renamed(cloud: PointCloud) -> list[str]:
+    """Say which columns become extra bytes of another name: theirs is a dimension's, or longer than 32 bytes."""
+    *_, labels = _laid_out(cloud)
+    short = [name.decode("utf-8", "replace") for name in _short_names(labels)]
+    return [f"{was} (renamed to {now})" for was, now in zip(labels.values(), short, strict=True) if was != now]
+
+
 def new_las(cloud: PointCloud) -> bytes:
     """Return a LAS 1.2 file, uncompressed; raises UnsupportedCloud where a position is NaN or infinite.
 
     Attributes with the name of a standard dimension that fit into it take its place, the others become extra bytes.
     """
     scales, offsets, integers = _quantised(cloud.xyz)
-    point_format, held, extra = _laid_out(cloud)
+    point_format, held, extra, _ = _laid_out(cloud)
     standard = standard_dimensions(point_format)
     points = np.zeros((len(cloud), standard_bytes(point_format)), np.uint8)
     points[:, :12] = integers.astype("<i4").view(np.uint8)
@@ -55,20 +62,26 @@ def new_las(cloud: PointCloud) -> bytes:
     return head + record + rows.tobytes()
 
 
-def _laid_out(cloud: PointCloud) -> tuple[int, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]]]:
-    """Return the point format, the columns that its dimensions hold, and those of extra bytes."""
+def _laid_out(
+    cloud: PointCloud,
+) -> tuple[int, dict[str, npt.NDArray[Any]], dict[str, npt.NDArray[Any]], dict[str, str]]:
+    """Return the point format, the columns that its dimensions hold, those of extra bytes, and what these were called.
+
+    The last by the names that they have now.
+    """
     columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
     has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
     has_time = "gps_time" in columns and _is_double(columns["gps_time"])
     point_format = 2 * has_rgb + has_time
     standard = standard_dimensions(point_format)
     held = {n: values for n, values in columns.items() if n in standard and _fits(values, standard[n])}
-    extra = _extra(columns, held, {*standard, *_RESERVED})
+    labels = _labels([name for name in columns if name not in held], columns, {*standard, *_RESERVED})
+    extra = {label: columns[name] for label, name in labels.items()}
     if len(extra) > MAX_EXTRA_DIMENSIONS:
         raise UnsupportedCloud(
             f"{len(extra)} attributes are more than the {MAX_EXTRA_DIMENSIONS} that LAS extra bytes hold"
         )
-    return point_format, held, extra
+    return point_format, held, extra, labels
 
 
 def _check_positions(xyz: npt.NDArray[np.float64]) -> None:
@@ -124,18 +137,15 @@ def _bytes(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(values).view(np.uint8).reshape(len(values), values.dtype.itemsize)
 
 
-def _extra(
-    columns: Mapping[str, npt.NDArray[Any]], held: Collection[str], reserved: Collection[str]
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns that are not held, none with a reserved name: laspy would not open the file."""
-    extra: dict[str, npt.NDArray[Any]] = {}
-    for name, values in columns.items():
+def _labels(names: Iterable[str], taken: Collection[str], reserved: Collection[str]) -> dict[str, str]:
+    """Return what extra bytes of these names are called, none with a reserved name: laspy would not open the file."""
+    labels: dict[str, str] = {}
+    for name in names:
         label = name
-        while label in reserved or (label != name and label in columns):
+        while label in reserved or (label != name and label in taken):
             label = f"extra_{label}"
-        if name not in held:
-            extra[label] = values
-    return extra
+        labels[label] = name
+    return labels
 
 
 def _extra_bytes_record(extra: dict[str, npt.NDArray[Any]]) -> bytes:

@@ -76,6 +76,18 @@ def test_names_that_no_header_carries_become_others_and_are_named(target: str, t
         np.testing.assert_array_equal(again[name], np.arange(3) + index)
 
 
+@pytest.mark.parametrize("target", ["las", "laz"])
+def test_columns_whose_names_las_has_no_room_for_are_named(target: str, tmp_path: Path) -> None:
+    distance, half = "scalar_C2C_absolute_distances__X_", np.arange(3) + 0.5  # as CloudCompare calls them
+    cloud = PointCloud(torus(3), {"intensity": half, distance: half + 1, f"{distance}_2": half + 2, "roughness": half})
+    said = ["intensity (renamed to extra_intensity)", f"{distance} (renamed to {distance[:32]})"]
+    said.append(f"{distance}_2 (renamed to {distance[:30]}_2)")
+    assert format_named(target).left_behind(cloud) == said
+    again = converted(cloud, target, tmp_path).attributes
+    for index, name in enumerate(["extra_intensity", distance[:32], f"{distance[:30]}_2"]):
+        np.testing.assert_array_equal(again[name], half + index)
+
+
 def test_columns_of_text_faces_and_records_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x,y,z,kind,w\n1,2,3,tree,7\n")
     table = read_cloud(tmp_path / "a.csv")[0]
