@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -35,9 +36,24 @@ class JobFolders:
         data_dir.mkdir(mode=_MODE, parents=True, exist_ok=True)
         for folder in (self._jobs, self._incoming, self._servers):
             folder.mkdir(mode=_MODE, exist_ok=True)
+        self._check_moves()
         self.server = uuid.uuid4().hex
         self._lock: IO[bytes] = self._lock_path(self.server).open("wb")
         fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def _check_moves(self) -> None:
+        """Raise OSError where a file cannot be moved from `incoming` to `jobs`: one of them is mounted, or a link."""
+        handle, upload = tempfile.mkstemp(dir=self._incoming)
+        os.close(handle)
+        try:
+            moved = Path(upload).replace(self.path(Path(upload).name))
+        except OSError as exc:
+            Path(upload).unlink()
+            if exc.errno != errno.EXDEV:
+                raise
+            where = f"{self._jobs} and {self._incoming} are not on one disk"
+            raise OSError(exc.errno, f"{where}: mount or link their folder, not one of them") from exc
+        moved.unlink()
 
     def close(self) -> None:
         """Let go of this server's lock."""

@@ -6,6 +6,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import uuid
 from collections.abc import Callable
 from contextlib import closing
@@ -77,3 +78,15 @@ def test_what_others_have_in_a_data_directory_stays_there(tmp_path: Path) -> Non
         assert server._status("/livez") == 200
         assert [path.read_text() for path in theirs] == ["kept"] * len(theirs)
         assert not ours.exists()
+
+
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no second disk here")
+def test_folders_on_two_disks_are_refused_at_the_start(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as other:
+        (tmp_path / "jobs").symlink_to(other)
+        command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
+        done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60)
+        assert done.returncode == 2
+        assert f"{tmp_path}/jobs and {tmp_path}/incoming are not on one disk" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not [*Path(other).iterdir(), *(tmp_path / "incoming").iterdir()]
