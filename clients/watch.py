@@ -29,7 +29,8 @@ def watch_folder(
     """Denoise every cloud in `folder` that has no namesake of the same time in `target`, as they come.
 
     A result gets the time of its input as it was before it was read: an input that is replaced meanwhile, even by an
-    older file, is seen to be another. A file is taken when its size and time have not changed for a second, so that one
+    older file, is seen to be another. A namesake that was written after its input came is let be, too: somebody may
+    have worked on a result. A file is taken when its size and time have not changed for a second, so that one
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
     server could not be had, at the next look, or, where the disk was full, when more of it is free. Yields each
     outcome. once: look once, and end.
@@ -46,7 +47,7 @@ def watch_folder(
         }
         for path, stamp in seen.items():
             result = target / path.name
-            if tried.get(path) == stamp or _is_done(result, stamp) or _is_full(target, full.get(path)):
+            if tried.get(path) == stamp or _is_done(path, result, stamp) or _is_full(target, full.get(path)):
                 continue
             if not once and before.get(path) != stamp:
                 continue  # perhaps it still grows
@@ -87,6 +88,16 @@ def _is_full(target: Path, free: int | None) -> bool:
     return free is not None and shutil.disk_usage(target).free <= free
 
 
-def _is_done(result: Path, stamp: Stamp) -> bool:
+def _is_done(path: Path, result: Path, stamp: Stamp) -> bool:
     done = _stamp(result)
-    return done is not None and done[1] == stamp[1]
+    return done is not None and (done[1] == stamp[1] or _is_later(result, path))
+
+
+def _is_later(result: Path, path: Path) -> bool:
+    """Tell whether a result was written after its input came, in its place or by itself: of which `ctime` tells."""
+    try:
+        came, written = path.stat().st_ctime_ns, result.stat()
+    except OSError:
+        return False
+    # Both: the time of a result may be told, as that of an input.
+    return os.name == "posix" and min(written.st_mtime_ns, written.st_ctime_ns) > came

@@ -105,6 +105,17 @@ def test_what_is_done_stays_done_for_the_next_process_until_it_changes(folder: P
     assert once(folder) == ["an older one"]
 
 
+def test_a_result_that_somebody_worked_on_is_let_be_until_its_input_changes(folder: Path) -> None:
+    assert once(folder) == ["first"]
+    time.sleep(0.05)  # a file system's clock ticks
+    (result := folder / "clean" / "scan.ply").write_bytes(b"a part of the first")
+    assert once(folder) == []
+    assert result.read_bytes() == b"a part of the first"
+    time.sleep(0.05)
+    replace(folder / "scan.ply", b"an older one", age=3600.0)
+    assert once(folder) == ["an older one"]
+
+
 def test_a_file_system_that_keeps_no_exact_times_does_not_make_it_go_on_for_ever(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
