@@ -20,7 +20,7 @@ CONNECT_TIMEOUT_SECONDS = 10.0
 # A stream keeps its own for as long as its job runs; a process has descriptors for a thousand or so.
 _LIMITS = httpx2.Limits(max_connections=500, max_keepalive_connections=20)
 _Client = TypeVar("_Client", httpx2.Client, httpx2.AsyncClient)
-_FAULTS = (httpx2.TransportError, httpx2.SSEError)
+_FAULTS = (httpx2.TransportError, httpx2.DecodingError)
 
 
 class HttpTransport(Transport):

@@ -88,8 +88,12 @@ class Events:
         self._is_over = status == 204
 
     def write(self, item: Any) -> None:
-        """Take one server-sent event."""
-        event = parse_event(item.event, item.id or "", item.data)
+        """Take one server-sent event; raises ConnectionFailed for one that is no server's of ours."""
+        try:
+            event = parse_event(item.event, item.id or "", item.data)
+        except (ValueError, KeyError, TypeError) as exc:
+            told = f"{item.event[:20]!r} {item.data[:80]!r} ({type(exc).__name__}: {exc})"
+            raise ConnectionFailed(f"this is no event of a StraightPCF server: {told}") from exc
         if event is None:
             return
         self.furthest = max(self.furthest, event.id)

@@ -24,7 +24,9 @@ __all__ = ["Health", "ServerInfo", "failed_connection", "failed_response", "pars
 
 _GATEWAY = (502, 503, 504)  # of a proxy, whose server is gone or restarted: what ours says of itself has a code
 # A request that may have reached the server is sent again only because every one of ours is idempotent.
-_RETRYABLE_FAULTS = (httpx2.NetworkError, httpx2.TimeoutException, httpx2.RemoteProtocolError, httpx2.SSEError)
+_RETRYABLE_FAULTS = (
+    httpx2.NetworkError, httpx2.TimeoutException, httpx2.RemoteProtocolError, httpx2.SSEError, httpx2.DecodingError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +85,7 @@ def failed_response(response: httpx2.Response) -> Failure:
     )
 
 
-def failed_connection(fault: httpx2.TransportError | httpx2.SSEError, url: object) -> Failure:
+def failed_connection(fault: httpx2.TransportError | httpx2.DecodingError, url: object) -> Failure:
     """Turn what the network did into our error."""
     error = ConnectionFailed(f"{url}: {type(fault).__name__}: {fault}")
     return Failure(error=error, retryable=isinstance(fault, _RETRYABLE_FAULTS), cause=fault)

@@ -230,6 +230,30 @@ def test_a_page_that_a_proxy_sends_for_a_result_is_not_taken_for_one(server: Run
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("status", ["200 OK", "500 Internal Server Error"])
+def test_an_answer_that_was_damaged_on_its_way_is_asked_for_again(status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    damaged = canned(status, "no gzip at all", "Content-Encoding: gzip")
+    with answering(damaged, HEALTHY) as (url, heads), Client(url) as client:
+        assert client.health().ready
+        assert len(heads) == 2
+    refused = pytest.raises(ConnectionFailed, match="DecodingError")
+    with answering(damaged) as (url, _), Client(url, max_retries=0) as client, refused:
+        client.health()
+
+
+@pytest.mark.parametrize("said", ["id: x\ndata: {}", "id: 1\ndata: {}", "id: 1\ndata: {oops", "id: 1\ndata: null"])
+def test_an_event_of_another_server_is_told_as_such(said: str, server: RunningServer) -> None:
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(400), 0.01), iterations=1)
+        told = canned("200 OK", json.dumps(job.info.json))
+    event = canned("200 OK", f"event: queued\n{said}\n\n", "Content-Type: text/event-stream")
+    with answering(told, event) as (url, _), Client(url, max_retries=0) as client:
+        proxied = client.jobs.get(job.id)
+        with pytest.raises(ConnectionFailed, match="no event of a StraightPCF server: 'queued'"):
+            list(proxied.events())
+
+
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
     moved = canned("301 Moved Permanently", "", "Location: https://clouds.example/healthz")
     refused = pytest.raises(InvalidRequest, match=r"https://clouds\.example/healthz")
