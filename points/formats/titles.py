@@ -36,7 +36,7 @@ _POLAR = (
     {"azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"},
     {"range", "distance", "dist", "radius", "r", "rho", "elevation", "elev", "el", "zenith", "inclination"},
 )
-_VALUE = re.compile(r"[-+.]?\d")  # how a word begins that is none of column names of these kinds
+_VALUE = re.compile(r"[-+.]?\d[\d.,]*[^\w:-]*[A-Za-z]{0,2}")  # 48.1, 0..360, 120m: no name of a column, as 1_lat is
 _NO_LETTERS = re.compile(r"[^a-z]+")
 _UNIT = re.compile(r"\s*(\[.*\]|\(.*\))$")
 _BEFORE_UNIT = re.compile(rb"(?<!\s)\s++(?=[\[(])")
@@ -152,7 +152,7 @@ def _hold(sets: Sequence[set[str]], words: Sequence[str]) -> bool:
 
     `lat 48.1 long 9.2`, where a scanner stood, is none of names.
     """
-    if any(map(_VALUE.match, words)):
+    if any(map(_VALUE.fullmatch, words)):
         return False
     plain = {part for word in words for part in _NO_LETTERS.split(_UNIT.sub("", word).lower())}
     return all(plain & names for names in sets)

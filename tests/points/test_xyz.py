@@ -67,6 +67,7 @@ TABLES = {
     "three names of any kind": b"a,b,c\n1,2,3\n4,5,6\n",
     "a remark of as many words": b"# made by a program\n1 2 3 7\n4 5 6 8\n",
     "where a scanner stood": b"# lat: 48.1 long: -9.2\n1 2 3 7\n4 5 6 8\n",
+    "where it stood, with signs of degrees": "# lat 48.1\u00b0N long 9.2\u00b0\n1 2 3 7\n4 5 6 8\n".encode(),
     "what a scanner looked at": b"# az 0..360 range 120\n1 2 3 7\n4 5 6 8\n",
     "byte order mark": b"\xef\xbb\xbf1 2 3\n4 5 6\n",
     "count": b"2\n1 2 3 -100 255 255 255\n4 5 6 -100 0 0 0\n",

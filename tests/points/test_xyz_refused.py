@@ -111,6 +111,8 @@ MALFORMED = {
     "degrees": (b"Lat,Lon,Alt (m)\n1,2,3\n", r"names above line 2 are of degrees.*Lat,Lon,Alt.*project"),
     "degrees in a comment": (b"# longitude latitude height\n1 2 3\n", r"names above line 2 are of degrees"),
     "degrees with their unit": (b"gps_lat,gps_lon,alt_m\n1,2,3\n", r"names .*of degrees.*gps_lat,gps_lon"),
+    "degrees in numbered names": (b"1_lat,2_lon,3_alt\n1,2,3\n", r"names .*of degrees"),
+    "degrees in numbered remarks": (b"# 1:lat 2:lon 3:alt\n1 2 3\n", r"names .*of degrees"),
     "angles": (b"range, azimuth, elevation\n1,2,3\n", r"names above line 2 are of angles: 'range, azimuth.*into x, y"),
     "angles in a comment": (b"# Range [m] Azimuth_deg Elev. I\n1 2 3 4\n", r"names .*of angles: 'Range \[m\] Azi"),
     "cylinders": (b"r\tphi\tz\n1 2 3\n", r"names .*of angles"),

@@ -17,7 +17,7 @@ const POSITIONS = [
   ["x1", "y1", "z1"],
   ["0", "1", "2"],
 ];
-const VALUE = /^[-+.]?\d/;
+const VALUE = /^[-+.]?\d[\d.,]*[^\w:-]*[A-Za-z]{0,2}$/; // 48.1, 0..360, 120m: no name of a column, as 1_lat is
 const DEGREES = [["lat", "latitude"], ["lon", "lng", "long", "longitude"]];
 const POLAR = [
   ["azimuth", "azimuthal", "azim", "az", "bearing", "theta", "phi"],
