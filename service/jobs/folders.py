@@ -26,6 +26,7 @@ _ORPHAN_SECONDS = 3600.0  # an upload, folder or lock that nobody owns is given 
 # What is called otherwise is no server's: a data directory may be a folder that had a `jobs` of its own.
 _OURS = re.compile(r"[0-9a-f]{32}")  # folders and locks
 _UPLOAD = re.compile(r"tmp\w{8}")  # as mkstemp calls them
+_ANY = re.compile(r".*", re.DOTALL)
 
 
 class JobFolders:
@@ -104,11 +105,11 @@ class JobFolders:
 
     def incoming_bytes(self) -> int:
         """Return how large all uploads on their way in are."""
-        return _bytes_in(self._incoming)
+        return _bytes_in(self._incoming, _UPLOAD)
 
     def used_bytes(self) -> int:
         """Return how large the files of all jobs are, and of all uploads on their way in."""
-        return _bytes_in(self._jobs) + self.incoming_bytes()
+        return _bytes_in(self._jobs, _OURS) + self.incoming_bytes()
 
     def free_bytes(self) -> int:
         """Return how much room the disk has."""
@@ -169,10 +170,13 @@ def _old_in(folder: Path) -> list[Path]:
     return old
 
 
-def _bytes_in(folder: Path) -> int:
-    size = 0
-    for at, _, names in os.walk(folder):  # which passes over a folder that is removed meanwhile
-        for name in names:
+def _bytes_in(folder: Path, ours: re.Pattern[str] = _ANY) -> int:
+    """Return how large the files in a folder are; ours: what is called otherwise in it does not count."""
+    size, here = 0, os.fspath(folder)
+    for at, folders, names in os.walk(folder):  # which passes over a folder that is removed meanwhile
+        if at == here:
+            folders[:] = filter(ours.fullmatch, folders)
+        for name in filter(ours.fullmatch, names) if at == here else names:
             with suppress(FileNotFoundError):
                 size += Path(at, name).stat().st_size
     return size

@@ -64,10 +64,13 @@ def test_an_upload_that_nobody_finished_is_dropped_and_what_is_of_others_is_let_
     with closing(JobFolders(tmp_path)) as folders:
         incoming, jobs = tmp_path / "incoming", tmp_path / "jobs"
         (incoming / "folder").mkdir()
-        (incoming / "letter.txt").touch()
+        (incoming / "letter.txt").write_text("a letter")
         os.close(tempfile.mkstemp(dir=incoming)[0])
         (jobs / "2024").mkdir()
+        (jobs / "2024" / "report.txt").write_text("a report")
         (jobs / (job := uuid.uuid4().hex)).mkdir()
+        (jobs / job / "input").write_text("a cloud")
+        assert (folders.incoming_bytes(), folders.used_bytes()) == (0, len("a cloud"))
         for path in (*incoming.iterdir(), *jobs.iterdir()):
             os.utime(path, (LONG_AGO, LONG_AGO))
         with folders.upload() as sending:  # slowly: longer than an upload that nobody owns is kept
