@@ -1,6 +1,7 @@
 """Filter clouds unlike those of training: noise that differs from place to place, grids, outliers, points that are few.
 
 python -m benchmarks.conditions [half-1-3 ramp voxels ...] [--shapes torus plate] [--archive unseen.npz] [--seeds 0 1]
+    [--weights runs/weights.safetensors]
 
 CD and mean squared height over the surface, x1e-4, in radii of the bounding sphere, of each cloud as it came and as it
 ends (`auto`), of analytic shapes, or of an archive's, whose 50K points stand for their surface. Of noise in two halves
@@ -51,11 +52,12 @@ def main() -> None:
     parser.add_argument("--archive", type=Path, help="an .npz as training takes it")
     parser.add_argument("--resolution", type=int, default=10_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--weights", type=Path, help="default: the shipped ones")
     parser.add_argument("--threads", type=int)
     arguments = parser.parse_args()
     if unknown := set(arguments.conditions) - set(CONDITIONS):
         parser.error(f"no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")
-    model = load_filter(device="cpu", threads=arguments.threads)
+    model = load_filter(arguments.weights, device="cpu", threads=arguments.threads)
     truths = dict(_truths(arguments.archive, arguments.shapes, arguments.resolution))
     for name in arguments.conditions or CONDITIONS:
         rows = []
