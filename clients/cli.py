@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 import straightpcf
 from straightpcf.clients import job_commands
-from straightpcf.clients.atomic import check_target, replaced_when_complete
+from straightpcf.clients.atomic import check_target, place_named, replaced_when_complete
 from straightpcf.clients.console import (
     INTERRUPTED,
     asked_to_stop,
@@ -301,7 +301,7 @@ def train(
         done = step.iteration
         show(done / iterations, f"loss {step.loss:.3e}")
 
-    with asked_to_stop() as stop, progress_bar(f"training {stage.value}") as show:
+    with asked_to_stop() as stop, progress_bar(f"training {stage.value}") as show, place_named(run_dir):
         run_training(
             stage.value,
             data=data,

@@ -58,11 +58,13 @@ def save_state(
     scratch = path.with_suffix(".tmp")
     try:
         save_file(tensors, scratch, metadata=metadata)
+        with scratch.open("rb+") as file:  # on the disk before it takes the old one's place
+            os.fsync(file.fileno())
+        scratch.replace(path)
     except SafetensorError as exc:
         raise OSError(f"{path} cannot be written: {exc}") from exc
-    with scratch.open("rb+") as file:  # on the disk before it takes the old one's place
-        os.fsync(file.fileno())
-    scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)  # half of one would keep a full disk full
 
 
 def load_state(

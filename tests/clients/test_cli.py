@@ -244,6 +244,16 @@ def test_training_refuses_what_it_cannot_use_by_code(
     assert (done.exit_code, text in done.stderr) == (code, True), done.stderr
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+def test_a_log_that_finds_no_room_is_told_with_the_place(tmp_path: Path) -> None:
+    np.savez(data := tmp_path / "shapes.npz", **{f"{name}/1500": torus(1500) for name in "abcdef"})  # type: ignore[arg-type]
+    (run := tmp_path / "run").mkdir()
+    (run / "log.csv").symlink_to("/dev/full")
+    done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", "1", "--batch-size", "1")
+    assert done.returncode == 3
+    assert done.stderr == f"error [invalid_request]: [Errno 28] No space left on device: '{run}'\n"
+
+
 def test_a_stage_without_the_one_before_is_a_usage_error(tmp_path: Path) -> None:
     np.savez(data := tmp_path / "shapes.npz", **{"a/1500": torus(1500).astype(np.float32)})
     done = cli("train", "cvm", "--data", data, "--run-dir", tmp_path / "run")
