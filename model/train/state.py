@@ -12,7 +12,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
+from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint, refuse_folder
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
@@ -127,6 +127,7 @@ def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
 
 
 def _header(path: Path) -> dict[str, str]:
+    refuse_folder(path)
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}
