@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 
-from straightpcf.model.train.command import errors_in_one_line
+from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
 
-__all__ = ["errors_in_one_line", "noise_level"]
+__all__ = ["errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
 
 
 def noise_level(text: str) -> float:

@@ -30,6 +30,8 @@ def opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             yield archive
+    except KeyError as exc:  # numpy's says so
+        raise MalformedFile(f"{path}: {exc.args[0]}") from exc
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as exc:
         raise MalformedFile(f"{path} cannot be read as NPZ: {exc}") from exc
 

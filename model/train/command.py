@@ -9,7 +9,7 @@ from pathlib import Path
 
 from straightpcf.points.errors import StraightPCFError
 
-__all__ = ["archive_to_write", "errors_in_one_line", "positive", "seed_number"]
+__all__ = ["archive_to_write", "errors_in_one_line", "file_to_write", "positive", "seed_number"]
 
 
 @contextmanager
@@ -23,9 +23,16 @@ def errors_in_one_line() -> Iterator[None]:
 
 def archive_to_write(text: str) -> Path:
     """Read the name of an archive, for argparse: what cannot be written is found out before the minutes of work."""
-    path = Path(text)
-    if path.suffix != ".npz":
+    if not text.endswith(".npz"):
         raise argparse.ArgumentTypeError(f"{text} is no name for an archive, which ends in .npz")
+    return file_to_write(text)
+
+
+def file_to_write(text: str) -> Path:
+    """Read the name of a file, for argparse, as `archive_to_write` does."""
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} is a folder")
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{path.parent} is no folder to write {path.name} to")
     return path

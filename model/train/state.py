@@ -16,7 +16,7 @@ from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint, refus
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Average", "average_with", "load_state", "read_network", "save_state", "take_distance_module"]
+__all__ = ["Average", "average_with", "load_state", "read_header", "read_network", "save_state", "take_distance_module"]
 
 
 class Average:
@@ -88,7 +88,7 @@ def load_state(
 
 def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
     """Return the averaged network of a run's state, or that of shipped weights, and the run's progress."""
-    if "progress" not in _header(path):
+    if "progress" not in read_header(path):
         return load_checkpoint(path), dict(read_checkpoint(path)[1].get("training", {}))
     tensors, metadata = _read(path)
     average = _under(tensors, "average.")
@@ -119,14 +119,15 @@ def average_with(network: StraightPCF, path: Path, share: float = 0.5) -> dict[s
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    metadata = _header(path)
+    metadata = read_header(path)
     if "progress" not in metadata:
         raise MalformedFile(f"{path} is no training state: its header has no progress")
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
 
 
-def _header(path: Path) -> dict[str, str]:
+def read_header(path: Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file; a state's has `progress`."""
     refuse_folder(path)
     try:
         with safe_open(path, framework="pt") as file:
