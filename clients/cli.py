@@ -327,6 +327,8 @@ def train(
         if stop() and done < iterations:
             typer.echo(f"stopped after iteration {done} of {iterations}; the same command goes on from there", err=True)
             raise typer.Exit(INTERRUPTED)
+        if not done:
+            typer.echo(f"nothing to do: {run_dir} is at iteration {iterations} or beyond", err=True)
 
 
 @app.command()
