@@ -5,7 +5,8 @@ set -euo pipefail
 cd "$(dirname "$0")"
 
 need=(g++ curl)                       # g++ compiles the CPU kernels at first use; the tests call curl
-${PYTHON:-python3} -c 'import venv, ensurepip' 2>/dev/null || need+=(python3-venv)
+python=${PYTHON:-python3}
+"$python" -c 'import venv, ensurepip' 2>/dev/null || need+=("$(basename "$python")-venv") # it brings python3, too
 missing=()
 for package in "${need[@]}"; do
   dpkg -s "$package" >/dev/null 2>&1 || missing+=("$package")
@@ -16,7 +17,12 @@ if ((${#missing[@]})); then
   $sudo apt-get install -q -y --no-install-recommends "${missing[@]}"
 fi
 
-[ -x .venv/bin/python ] || ${PYTHON:-python3} -m venv .venv
+# Before .venv is made of it, which the next run would take again.
+if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+  echo "$python is no Python 3.11 or newer; with one, say PYTHON=python3.12 bash install.sh" >&2
+  exit 1
+fi
+[ -x .venv/bin/pip ] || "$python" -m venv .venv # without pip it was left by a run that failed
 torch=${STRAIGHTPCF_TORCH:-$(command -v nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)}
 if [ "$torch" = cpu ] && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
   # The public index serves CUDA builds of torch; PyTorch's own serves the CPU build. Where that one cannot be

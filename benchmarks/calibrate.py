@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, noise_level
+from benchmarks.command import errors_in_one_line, file_to_write, noise_level, positive
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
@@ -27,6 +27,7 @@ from straightpcf.model.checkpoint import read_checkpoint, save_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.archive import opened
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
 
@@ -54,8 +55,8 @@ def main() -> None:
     parser.add_argument("--traces", type=Path, help="keep what was measured here, and use what is there")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=NOISE_LEVELS)
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
-    parser.add_argument("--threads", type=int, default=None)
-    parser.add_argument("--out", type=Path, nargs="?", const=DEFAULT_WEIGHTS, default=None)
+    parser.add_argument("--threads", type=positive, default=None)
+    parser.add_argument("--out", type=file_to_write, nargs="?", const=DEFAULT_WEIGHTS, default=None)
     arguments = parser.parse_args()
     if arguments.keep is not None and (arguments.distance or arguments.table or arguments.traces):
         parser.error("--keep takes all from one file and measures nothing: no --distance, --table or --traces with it")
@@ -70,7 +71,7 @@ def main() -> None:
         return
     if arguments.distance is not None:
         take_distance_module(network, arguments.distance)
-    with np.load(arguments.data, allow_pickle=False) as archive:
+    with opened(arguments.data) as archive:
         shapes = sorted({key.split("/")[0] for key in archive.files})
         dense = _read(archive, [f"{shape}/{_TABLE_CLOUDS}" for shape in shapes[1::_TABLE_EVERY]])
         every = [f"{shape}/10000" for shape in shapes] + [f"{shape}/50000" for shape in shapes[3::8]]

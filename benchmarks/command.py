@@ -4,21 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
-from straightpcf.points.errors import StraightPCFError
+from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
 
-__all__ = ["errors_in_one_line", "noise_level"]
-
-
-@contextmanager
-def errors_in_one_line() -> Iterator[None]:
-    """End in one line where a file is missing or is not what it should be."""
-    try:
-        yield
-    except (OSError, StraightPCFError) as error:
-        raise SystemExit(str(error)) from error
+__all__ = ["errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
 
 
 def noise_level(text: str) -> float:

@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import errors_in_one_line, positive, seed_number
 from benchmarks.passes import Truth
 from benchmarks.shapes import ANALYTIC, analytic
 from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.archive import opened
 
 __all__ = ["CONDITIONS", "Condition"]
 
@@ -50,10 +51,10 @@ def main() -> None:
     parser.add_argument("conditions", nargs="*", metavar="CONDITION", help=f"of {', '.join(CONDITIONS)}; default: all")
     parser.add_argument("--shapes", nargs="+", help=f"default: all of the archive, or {', '.join(ANALYTIC)}")
     parser.add_argument("--archive", type=Path, help="an .npz as training takes it")
-    parser.add_argument("--resolution", type=int, default=10_000)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--resolution", type=positive, default=10_000)
+    parser.add_argument("--seeds", type=seed_number, nargs="+", default=[0])
     parser.add_argument("--weights", type=Path, help="default: the shipped ones")
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
     if unknown := set(arguments.conditions) - set(CONDITIONS):
         parser.error(f"no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")
@@ -92,7 +93,7 @@ def _truths(archive: Path | None, shapes: list[str] | None, resolution: int) -> 
             frame = CloudFrame.of(fine.clean)
             yield coarse.name, Truth.of(frame.enter(coarse.clean), frame.enter(fine.clean))
         return
-    with np.load(archive, allow_pickle=False) as file:
+    with opened(archive) as file:
         for shape in sorted(shapes or {name.split("/")[0] for name in file.files}):
             yield shape, Truth.read(file, shape, resolution)
 

@@ -20,13 +20,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, noise_level
+from benchmarks.command import errors_in_one_line, noise_level, positive, seed_number
 from benchmarks.passes import Truth
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS, Filter
+from straightpcf.model.train.archive import opened
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network, take_distance_module
 from straightpcf.points.errors import InvalidOptions
@@ -43,15 +44,17 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument("--unseen", type=Path, action="append", default=[])
     parser.add_argument("--shapes", nargs="+", help="default: all that are held out or unseen")
-    parser.add_argument("--resolution", type=int, default=10000, help="one that the archives have, or see --random")
+    parser.add_argument(
+        "--resolution", type=positive, default=10000, help="one that the archives have, or see --random"
+    )
     parser.add_argument("--random", action="store_true", help="points by chance, as from a mesh, instead of even ones")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.02, 0.03])
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[0, 1], help="of the noise; one is too little to judge by"
+        "--seeds", type=seed_number, nargs="+", default=[0, 1], help="of the noise; one is too little to judge by"
     )
     parser.add_argument("--iterations", default="4", help='of all candidates, "auto" or 1..10')
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
     options = DenoiseOptions.parse(iterations=arguments.iterations)
     truths = dict(_truths(arguments))
@@ -74,7 +77,7 @@ def main() -> None:
 def _truths(arguments: argparse.Namespace) -> Iterator[tuple[str, Truth]]:
     """Yield the shapes asked for, in their unit-ball frames."""
     for path in [arguments.data, *arguments.unseen]:
-        with np.load(path, allow_pickle=False) as archive:
+        with opened(path) as archive:
             every = {name.split("/")[0] for name in archive.files}
             held_out = held_out_shapes(archive.files) if path == arguments.data else every
             for shape in sorted(held_out if arguments.shapes is None else held_out.intersection(arguments.shapes)):

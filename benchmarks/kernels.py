@@ -28,7 +28,7 @@ OWNED = 334  # of a patch's points at 3-fold coverage
 def main() -> None:
     """Print a row per operation."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels")
-    parser.add_argument("--device", default="cpu", help='"cpu" (the default) or "cuda"')
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help='"cpu" (the default) or "cuda"')
     parser.add_argument("--every-set", action="store_true", help="the CPU's instruction sets, one by one, instead")
     arguments = parser.parse_args()
     device = arguments.device

@@ -20,13 +20,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from benchmarks.command import errors_in_one_line, noise_level
+from benchmarks.command import errors_in_one_line, noise_level, positive
 from benchmarks.quality import SHARED
 from benchmarks.shapes import make_noise
 from straightpcf.model.filter import Filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.normals import recompute_normals
+from straightpcf.model.train.archive import opened
 from straightpcf.model.train.data import held_out_shapes
 from straightpcf.model.train.state import read_network, take_distance_module
 from straightpcf.points.errors import InvalidOptions
@@ -96,11 +97,11 @@ def main() -> None:
     parser.add_argument("states", type=Path, nargs="+")
     parser.add_argument("--distance", type=Path, help="the state whose DistanceModule to take")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.01, 0.02])
-    parser.add_argument("--passes", type=int, default=4)
+    parser.add_argument("--passes", type=positive, default=4)
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
-    with np.load(arguments.data) as archive:
+    with opened(arguments.data) as archive:
         truths = [Truth.read(archive, shape, _RESOLUTION) for shape in sorted(held_out_shapes(archive.files))]
     print(f"{'velocities':40} noise  pass     CD  across   sunk")
     for state in arguments.states:

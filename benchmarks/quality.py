@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from safetensors import safe_open
 from torch import nn
 
-from benchmarks.command import errors_in_one_line, noise_level
+from benchmarks.command import errors_in_one_line, noise_level, positive, seed_number
 from benchmarks.conventional import jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
@@ -29,7 +28,7 @@ from straightpcf.model.filter import Filter, load_filter
 from straightpcf.model.metrics import chamfer_distance, point_to_mesh_distance
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
 from straightpcf.model.train.calibrate import Trace, every_pass, passes
-from straightpcf.model.train.state import read_network
+from straightpcf.model.train.state import read_header, read_network
 from straightpcf.points.options import DenoiseOptions
 
 Floats = npt.NDArray[np.float64]
@@ -76,6 +75,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.every_pass and (options.model, options.iterations) != ("ours", "auto"):
         raise SystemExit("--every-pass takes `auto` of this project's model apart: no other --model or --iterations")
     run = _runner(options)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
     rows = []
     for resolution in options.resolution:
         for noise in options.noise:
@@ -88,7 +89,6 @@ def main(arguments: list[str] | None = None) -> None:
             _summary(cell, resolution, noise, options)
             rows += cell
             if options.json:
-                options.json.parent.mkdir(parents=True, exist_ok=True)
                 options.json.write_text(json.dumps(_record(options, rows), indent=1) + "\n")
 
 
@@ -168,8 +168,7 @@ def _ours(options: argparse.Namespace) -> Filter:
 
 
 def _is_training_state(path: Path) -> bool:
-    with safe_open(path, framework="pt") as file:
-        return "progress" in (file.metadata() or {})
+    return "progress" in read_header(path)
 
 
 def _without_distance(network: StraightPCF) -> StraightPCF:
@@ -233,7 +232,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=f"Shapes of the validation split: {', '.join(ANALYTIC)}.",
     )
     parser.add_argument("--split", choices=("punet", "validation"), default="punet")
-    parser.add_argument("--resolution", type=int, nargs="+", default=[10000])
+    parser.add_argument("--resolution", type=positive, nargs="+", default=[10000])
     parser.add_argument("--noise", type=noise_level, nargs="+", default=[0.01, 0.02, 0.03], help="in unit-sphere radii")
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument(
@@ -246,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help='"auto" beside every fixed number of passes, which it is cut from: seconds are those of all of them',
     )
-    parser.add_argument("--euler-steps", type=int, help="N of the paper, 3 by default")
+    parser.add_argument("--euler-steps", type=positive, help="N of the paper, 3 by default")
     parser.add_argument("--coverage", type=float, help="patches a point, 3 by default; the published scheme takes 6")
     parser.add_argument("--every-evaluation", action="store_true", help="evaluate every point of a patch every time")
     parser.add_argument("--without-distance", action="store_true", help="d = 1, as in the paper's ablation")
@@ -254,8 +253,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--model", choices=("ours", "official", "jet", "noisy"), default="ours")
     parser.add_argument("--weights", type=Path, help="other weights, or the state of a training run")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--threads", type=int, help="CPU threads, all by default")
-    parser.add_argument("--seed", type=int, default=0, help="of made noise and of the filter")
+    parser.add_argument("--threads", type=positive, help="CPU threads, all by default")
+    parser.add_argument("--seed", type=seed_number, default=0, help="of made noise and of the filter")
     parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--json", type=Path, help="write every row there, after each cell")
     return parser

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.command import positive
 from straightpcf.model.cpus import usable_cpus
 
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
@@ -24,8 +25,8 @@ FIT_FROM = 10_000  # below, one patch is most of the cloud
 def main() -> None:
     """Print a row for each size."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--points", type=int, nargs="+", default=POINTS)
-    parser.add_argument("--threads", type=int, default=usable_cpus())
+    parser.add_argument("--points", type=positive, nargs="+", default=POINTS)
+    parser.add_argument("--threads", type=positive, default=usable_cpus())
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
     print(f"{options.threads} threads, one pass\n{'points':>9} {'seconds':>9} {'peak MiB':>9} {'points/s':>9}")

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import errors_in_one_line, positive
 from benchmarks.quality import SHARED
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import StraightPCFError
@@ -214,7 +214,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("files", type=Path, nargs="*", help="all of DATA/scans by default")
     parser.add_argument("--iterations", default="auto")
     parser.add_argument("--weights", type=Path)
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=positive)
     parser.add_argument("--data", type=Path, default=SHARED / "data")
     parser.add_argument("--pictures", type=Path, default=Path("runs/pictures"), help="folder for PNGs")
     return parser

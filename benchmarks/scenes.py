@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, noise_level
+from benchmarks.command import errors_in_one_line, noise_level, positive
 from straightpcf.model.filter import load_filter
 from straightpcf.points.options import DenoiseOptions
 
@@ -343,9 +343,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("scanners", nargs="*", metavar="SCANNER", help=f"of {', '.join(SCANNERS)}; default: all")
     parser.add_argument("--noise", type=noise_level, default=1.0, help="times each scanner's own")
     parser.add_argument("--iterations", default="auto")
-    parser.add_argument("--every", type=int, default=1, help="take each n-th point only")
+    parser.add_argument("--every", type=positive, default=1, help="take each n-th point only")
     parser.add_argument("--weights", type=Path, help="default: the shipped ones")
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=positive)
     parser.add_argument("--json", type=Path, help="write the figures here")
     return parser
 

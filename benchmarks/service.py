@@ -25,6 +25,7 @@ import httpx2
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.command import positive
 from straightpcf.clients.sdk import Client
 
 PARTS = ("overhead", "livez", "held", "kill", "memory")
@@ -209,11 +210,11 @@ def _rss(pid: int) -> float:
 def main() -> None:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--points", type=int, default=50_000)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--held", type=int, default=300)
-    parser.add_argument("--jobs", type=int, default=500)
-    parser.add_argument("--job-points", type=int, default=20_000)
+    parser.add_argument("--points", type=positive, default=50_000)
+    parser.add_argument("--repeats", type=positive, default=3)
+    parser.add_argument("--held", type=positive, default=300)
+    parser.add_argument("--jobs", type=positive, default=500)
+    parser.add_argument("--job-points", type=positive, default=20_000)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     args = parser.parse_args()
     print(f"{os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}, {threading.active_count()} thread here")

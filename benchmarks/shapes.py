@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.metrics import unit_sphere
+from straightpcf.model.train.archive import opened
 
 __all__ = ["ANALYTIC", "NOISE_TYPES", "Shape", "analytic", "make_noise", "punet"]
 
@@ -34,7 +35,7 @@ class Shape:
 
 def punet(data: Path, resolution: int, names: list[str] | None = None) -> list[Shape]:
     """Read the PUNet test shapes from `data`/punet_test.npz, all 20 or those named."""
-    with np.load(data / "punet_test.npz") as file:
+    with opened(data / "punet_test.npz") as file:
         known = sorted({key.split("/")[0] for key in file.files})
         if unknown := set(names or ()) - set(known):
             raise SystemExit(f"no shape {', '.join(sorted(unknown))}; known: {', '.join(known)}")

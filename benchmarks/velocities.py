@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import errors_in_one_line, positive
 from benchmarks.quality import SHARED
 from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.train.data import NOISE_STD, Batch, PatchSource
@@ -65,8 +65,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("states", nargs="+", help='a state.safetensors, or "official"')
     parser.add_argument("--data", type=Path, default=SHARED / "data")
-    parser.add_argument("--patches", type=int, default=160)
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--patches", type=positive, default=160)
+    parser.add_argument("--threads", type=positive, default=1)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     source = PatchSource.read(arguments.data / "punet_train.npz", validation=True)

@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 import straightpcf
 from straightpcf.clients import job_commands
-from straightpcf.clients.atomic import check_target, replaced_when_complete
+from straightpcf.clients.atomic import check_target, place_named, replaced_when_complete
 from straightpcf.clients.console import (
     INTERRUPTED,
     asked_to_stop,
@@ -301,7 +301,7 @@ def train(
         done = step.iteration
         show(done / iterations, f"loss {step.loss:.3e}")
 
-    with asked_to_stop() as stop, progress_bar(f"training {stage.value}") as show:
+    with asked_to_stop() as stop, progress_bar(f"training {stage.value}") as show, place_named(run_dir):
         run_training(
             stage.value,
             data=data,
@@ -327,6 +327,8 @@ def train(
         if stop() and done < iterations:
             typer.echo(f"stopped after iteration {done} of {iterations}; the same command goes on from there", err=True)
             raise typer.Exit(INTERRUPTED)
+        if not done:
+            typer.echo(f"nothing to do: {run_dir} is at iteration {iterations} or beyond", err=True)
 
 
 @app.command()

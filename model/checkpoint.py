@@ -8,6 +8,7 @@ too few or another shape is a MalformedFile that names it.
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import pickle
@@ -32,6 +33,7 @@ __all__ = [
     "load_official_checkpoint",
     "read_checkpoint",
     "read_official_checkpoint",
+    "refuse_folder",
     "save_checkpoint",
 ]
 
@@ -70,6 +72,7 @@ def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Straig
 
 def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
     """Return a safetensors file's tensors, on the CPU, and its metadata, without building a network."""
+    refuse_folder(path)
     try:
         with safe_open(path, framework="pt") as file:
             texts = file.metadata() or {}
@@ -135,6 +138,12 @@ def architecture_of(state: Mapping[str, torch.Tensor]) -> dict[str, int]:
         if (bias := state.get(f"{key}encoder.conv3.lin.bias")) is not None:
             found[name] = bias.numel()
     return found
+
+
+def refuse_folder(path: Path) -> None:
+    """Raise IsADirectoryError of what is one: safetensors says `No such device` of it, and no name."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def _architecture(sizes: Any, path: Path) -> dict[str, int]:

@@ -180,6 +180,35 @@ def test_a_file_that_is_missing_is_named_in_one_line(name: str, tmp_path: Path) 
     assert str(tmp_path) in line
 
 
+def test_an_archive_or_weights_that_cannot_be_read_are_named_in_one_line(tmp_path: Path) -> None:
+    (junk := tmp_path / "junk.npz").write_text("junk")
+    np.savez(tmp_path / "punet_test.npz", **{"a/10000": np.zeros((3, 3))})
+    for name, *arguments in (
+        ("held_out", DEFAULT_WEIGHTS, "--data", junk),
+        ("passes", DEFAULT_WEIGHTS, "--data", junk),
+        ("quality", "--split", "validation", "--weights", junk),
+        ("quality", "--split", "validation", "--weights", tmp_path),
+        ("quality", "--split", "punet", "--data", tmp_path, "--resolution", 7),
+    ):
+        ended = _run(str(name), *arguments)
+        assert ended.returncode == 1
+        (line,) = ended.stderr.splitlines()
+        assert str(tmp_path) in line
+
+
+@pytest.mark.parametrize("arguments", ["speed --patches 0", "speed --threads 0", "quality --resolution 0"])
+def test_a_count_of_nothing_is_a_usage_error(arguments: str) -> None:
+    ended = _run(*arguments.split())
+    assert ended.returncode == 2
+    assert "0 is no whole number of 1 or more" in ended.stderr.splitlines()[-1]
+
+
+def test_where_weights_cannot_be_written_is_said_before_they_are_made(tmp_path: Path) -> None:
+    ended = _run("calibrate", "--state", tmp_path / "none", "--out", tmp_path / "gone" / "weights.safetensors")
+    assert ended.returncode == 2
+    assert "is no folder to write weights.safetensors to" in ended.stderr.splitlines()[-1]
+
+
 def test_noise_that_is_no_number_is_a_usage_error() -> None:
     for text in ("nan", "inf", "-0.01"):
         with pytest.raises(argparse.ArgumentTypeError, match=text):

@@ -131,9 +131,9 @@ def _target(url: str) -> tuple[str, Any]:
 
 
 def _how(call: Call, api_key: str | None, timeout: float | None) -> dict[str, Any]:
-    """Return the metadata and, for a call with one short answer, the deadline."""
+    """Return the metadata and the deadline: of a call with one short answer, and of one that is given up by then."""
     short = call.rpc in ("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth")
-    return {"metadata": metadata_of(call, api_key), "timeout": call.patience(timeout) if short else None}
+    return {"metadata": metadata_of(call, api_key), "timeout": call.patience(timeout if short else None)}
 
 
 async def _asynchronous(messages: Iterator[Any]) -> AsyncIterator[Any]:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from straightpcf.model.normalize import CloudFrame, patch_scales, zoom_of
 from straightpcf.model.normals import recompute_normals
 from straightpcf.model.patches import PATCH_SIZE
-from straightpcf.points.errors import InvalidOptions, MalformedFile, TooFewPoints
+from straightpcf.model.train.archive import opened, read_array, split_name
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 
 __all__ = [
     "ALONG_BEAMS",
@@ -255,21 +253,27 @@ class PatchSource:
 
         Clean clouds (N, 3) are named `<shape>/<resolution>`; with them may be `<shape>/surface`, a finer one from which
         nothing is drawn, `<shape>/normals`, the unit normals of the one of most points, and `<shape>/eye`, (3,), where
-        the beams came from that met the points. Raises MalformedFile, and TooFewPoints of a cloud smaller than a patch.
+        the beams came from that met the points. Raises MalformedFile, TooFewPoints of a cloud smaller than a patch, and
+        InvalidOptions where no shape is left to train on, or to validate with.
         """
         shapes: dict[tuple[Path, str], list[npt.NDArray[np.float32]]] = {}
         beside: dict[str, dict[tuple[Path, str], npt.NDArray[np.float32]]] = {"normals": {}, "surface": {}, "eye": {}}
         for path in paths:
-            with _opened(path) as archive:
+            with opened(path) as archive:
                 held_out = held_out_shapes(archive.files)
                 for name in archive.files:
-                    shape, what = _split(name, path)
+                    shape, what = split_name(name, path)
                     if (shape in held_out) != validation:
                         continue
                     if what in beside:
-                        beside[what][path, shape] = _array(archive, name, path)
+                        beside[what][path, shape] = read_array(archive, name, path)
                     else:
-                        shapes.setdefault((path, shape), []).append(_array(archive, name, path))
+                        shapes.setdefault((path, shape), []).append(read_array(archive, name, path))
+        if validation and not shapes:
+            least = VALIDATION_EVERY // 2 + 1
+            raise InvalidOptions(
+                f"no shape of {', '.join(map(str, paths))} is held out to validate with; an archive of {least} has one"
+            )
         for (path, shape), normals in beside["normals"].items():
             clouds = shapes.get((path, shape), [])
             finest = beside["surface"].get((path, shape), max(clouds, key=len, default=normals))
@@ -317,45 +321,6 @@ class PatchSource:
         placed = [(points - origin) @ transform for points in (noisy, clean, drawn, surface)]
         when, passed = np.array([[time]]), np.array([[0.0]])
         return placed[0], placed[1], when, placed[2], placed[3], normals @ transform / scale, passed
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
-    """Open an archive; what zipfile, zlib and numpy find wrong with it becomes MalformedFile, here and only here."""
-    with path.open("rb") as file:
-        if not zipfile.is_zipfile(file):
-            raise MalformedFile(
-                f"{path} is no NPZ file; training takes clean clouds called <shape>/<resolution> in one"
-            )
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            yield archive
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as exc:
-        raise MalformedFile(f"{path} cannot be read as NPZ: {exc}") from exc
-
-
-def _split(name: str, path: Path) -> tuple[str, str]:
-    shape, _, what = name.partition("/")
-    if not shape or not what or "/" in what:
-        raise MalformedFile(f"{path}: an array is called {name[:80]!r}; it must be <shape>/<resolution>")
-    return shape, what
-
-
-def _array(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> npt.NDArray[np.float32]:
-    """Read a cloud or what stands beside one; all numbers are finite."""
-    values, what = archive[name], name.partition("/")[2]
-    is_array = isinstance(values, np.ndarray) and values.dtype.kind == "f"  # of another member, bytes
-    shape = values.shape if is_array else ()
-    if shape[-1:] != (3,) or len(shape) != (1 if what == "eye" else 2):
-        found = f"{values.dtype} {values.shape}" if isinstance(values, np.ndarray) else "no array"
-        raise MalformedFile(
-            f"{path}: {name[:80]} is {found}; it must be {'(3,)' if what == 'eye' else '(N, 3)'} floats"
-        )
-    if not np.isfinite(values).all():
-        raise MalformedFile(f"{path}: {name[:80]} holds NaN or infinity")
-    if what not in ("eye", "normals", "surface") and len(values) < PATCH_SIZE:
-        raise TooFewPoints(f"{path}: {name[:80]} has {len(values)} points; a training patch has {PATCH_SIZE}")
-    return values
 
 
 def near_first(rng: np.random.Generator) -> npt.NDArray[np.int64]:

@@ -15,6 +15,7 @@ from torch import nn
 
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.patches import PATCH_SIZE
+from straightpcf.model.train.archive import by_stem, opened, read_array, split_name
 from straightpcf.model.train.data import (
     REACH,
     SCALES,
@@ -24,11 +25,12 @@ from straightpcf.model.train.data import (
     Surface,
     near_first,
 )
-from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 
 __all__ = ["SHORTEST", "PassedCloud", "PassedClouds", "training_patches"]
 
 SHORTEST = 2 * (1 - TOUCH_UNTIL)  # d below which a patch is as good as clean
+_RECORDED = "<archive>/<shape>/<number>/xyz"  # or /frame
 
 
 @dataclass(frozen=True)
@@ -60,27 +62,30 @@ class PassedClouds:
         *,
         known: Mapping[tuple[Path, str], Surface] | None = None,
     ) -> None:
-        """Read what `write_passed` wrote of the shapes of the archives `data`; raises InvalidOptions where one lacks.
+        """Read what `write_passed` wrote of the shapes of the archives `data`; raises InvalidOptions where one lacks,
+        MalformedFile.
 
         distance: (B, PATCH_SIZE, 3) float32 patches -> (B, 1); it is asked without a gradient. known: surfaces of
         shapes by archive and name, so that their normals are computed once.
         """
-        archives = {path.stem: path for path in data}
+        archives = by_stem(data)
         surfaces: dict[tuple[str, str], Surface] = {}
         self.clouds: list[PassedCloud] = []
         for path in paths:
-            with np.load(path, allow_pickle=False) as recorded:
+            with opened(path) as recorded:
                 for name in recorded.files:
-                    archive, shape, _, what = name.split("/")
+                    archive, shape, number, what = split_name(name, path, rule=_RECORDED)
                     if what == "frame":
                         continue
+                    if (frame_name := f"{archive}/{shape}/{number}/frame") not in recorded:
+                        raise MalformedFile(f"{path} has {name[:80]}, and no {frame_name[:80]}")
                     if archive not in archives:
                         raise InvalidOptions(f"{path} has clouds of {archive}.npz, which is not among the data")
                     if (archive, shape) not in surfaces:
                         found = (known or {}).get((archives[archive], shape))
                         surfaces[archive, shape] = found or _surface(archives[archive], shape)
-                    xyz = recorded[name].astype(np.float64)
-                    *centre, radius = recorded[f"{name.rpartition('/')[0]}/frame"].tolist()
+                    xyz = read_array(recorded, name, path).astype(np.float64)
+                    *centre, radius = read_array(recorded, frame_name, path).tolist()
                     frame = CloudFrame(np.array(centre), radius)
                     self.clouds.append(PassedCloud(xyz, cKDTree(xyz), frame, surfaces[archive, shape]))
         if not self.clouds:

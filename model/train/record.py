@@ -20,8 +20,11 @@ import numpy.typing as npt
 from straightpcf.model.filter import Filter, Run, load_filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.tiles import Tiling
+from straightpcf.model.train.archive import by_stem, opened, read_array, split_name, write_archive
+from straightpcf.model.train.command import archive_to_write, errors_in_one_line, positive, seed_number
 from straightpcf.model.train.data import drawn_noise, held_out_shapes
 from straightpcf.model.train.state import read_network
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["write_passed"]
@@ -40,8 +43,10 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
     Shapes that are held out stay out. A cloud is named `<archive>/<shape>/<number>/xyz`, (N, 3) float32 in the
     frame in which the filter has it; `<archive>/<shape>/<number>/frame` is that one's centre and radius among the clean
     points. What is there so far is kept beside `path` now and then and where this is interrupted, and gone on with.
+    Raises InvalidOptions where that is of another recording, or two archives have one name, MalformedFile, OSError.
     """
     rng = np.random.default_rng(seed)
+    by_stem(data)
     shapes = {archive: _training_clouds(archive) for archive in data}
     part = path.with_suffix(".part.npz")
     of = [seed, [archive.stem for archive in data], _digest(denoiser)]
@@ -55,7 +60,7 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
             if time.monotonic() - kept_at > _KEPT_EVERY:
                 _keep(part, written, of, state)
                 kept_at = time.monotonic()
-        np.savez(path, **written)  # type: ignore[arg-type]
+        write_archive(path, written)
     except BaseException:
         _keep(part, written, of, state)
         raise
@@ -88,21 +93,21 @@ def _recorded(
 
 
 def _gone_on_with(part: Path, of: list[object], rng: np.random.Generator) -> dict[str, npt.NDArray[np.generic]]:
-    """Return what `_keep` kept of a recording of the same, with `rng` as it was then; of another, nothing."""
+    """Return what `_keep` kept of a recording of the same, with `rng` as it was then; nothing if there is none."""
     if not part.exists():
         return {}
-    with np.load(part, allow_pickle=False) as file:
+    with opened(part) as file:
+        if _PROGRESS not in file:
+            raise MalformedFile(f"{part} is no part of a recording: it has no {_PROGRESS}")
         theirs, state = json.loads(str(file[_PROGRESS]))
-        if theirs != of:
-            return {}
+        if theirs != of:  # hours of work, perhaps
+            raise InvalidOptions(f"{part} is of another seed, other data or weights: go on with those, or remove it")
         rng.bit_generator.state = state
         return {name: file[name] for name in file.files if name != _PROGRESS}
 
 
 def _keep(part: Path, written: Mapping[str, npt.NDArray[np.generic]], of: list[object], state: object) -> None:
-    scratch = part.with_suffix(".tmp.npz")
-    np.savez(scratch, **{_PROGRESS: np.array(json.dumps([of, state]))}, **written)  # type: ignore[arg-type]
-    scratch.replace(part)
+    write_archive(part, {_PROGRESS: np.array(json.dumps([of, state])), **written})
 
 
 def _digest(denoiser: Filter) -> int:
@@ -126,15 +131,19 @@ class _Recording(Run):
 
 def _training_clouds(archive: Path) -> dict[str, Clouds]:
     """Return the clean clouds of each shape that is not held out, the coarsest first, and where its beams came from."""
-    with np.load(archive, allow_pickle=False) as file:
+    with opened(archive) as file:
         held_out = held_out_shapes(file.files)
-        names = [name.split("/") for name in file.files]
+        names = [split_name(name, archive) for name in file.files]
         found: dict[str, Clouds] = {}
-        for shape, points in sorted((s, int(what)) for s, what in names if what.isdigit() and s not in held_out):
+        clouds = sorted((shape, int(what), what) for shape, what in names if what.isdecimal() and shape not in held_out)
+        for shape, _, points in clouds:
             if shape not in found:
-                found[shape] = [], file[f"{shape}/eye"].astype(np.float64) if f"{shape}/eye" in file else None
-            found[shape][0].append(file[f"{shape}/{points}"].astype(np.float64))
-        return found
+                eye = f"{shape}/eye"
+                found[shape] = [], read_array(file, eye, archive).astype(np.float64) if eye in file else None
+            found[shape][0].append(read_array(file, f"{shape}/{points}", archive).astype(np.float64))
+    if not found:
+        raise InvalidOptions(f"{archive} has no clouds called <shape>/<points> of a shape that is not held out")
+    return found
 
 
 def _interrupt(number: int, frame: object) -> None:
@@ -143,14 +152,15 @@ def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
+@errors_in_one_line()
 def _main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("path", type=Path, help="the .npz to write")
+    parser.add_argument("path", type=archive_to_write, help="the .npz to write")
     parser.add_argument("--data", type=Path, action="append", required=True, help="clean clouds; may be given again")
     parser.add_argument("--weights", type=Path, help="a checkpoint or a training state; the shipped weights by default")
-    parser.add_argument("--count", type=int, default=500, help="clouds to record, three of each filtered one")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--count", type=positive, default=500, help="clouds to record, three of each filtered one")
+    parser.add_argument("--seed", type=seed_number, default=0)
+    parser.add_argument("--threads", type=positive)
     options = parser.parse_args()
     denoiser = load_filter(device="cpu", threads=options.threads)
     if options.weights is not None:

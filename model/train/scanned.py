@@ -21,6 +21,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.archive import write_archive
+from straightpcf.model.train.command import archive_to_write, errors_in_one_line, positive, seed_number
 from straightpcf.model.train.level_set import LevelSet
 from straightpcf.model.train.places import PLACES, Place
 from straightpcf.model.train.primitives import Solid, log_uniform
@@ -143,15 +145,20 @@ def write_scanned(path: Path, count: int, *, seed: int = 0, what: Scanned = SCAN
         arrays[f"{name}/surface"] = xyz[kept].astype(np.float32)
         arrays[f"{name}/normals"] = normals[kept].astype(np.float32)
         arrays[f"{name}/eye"] = eye.astype(np.float32)
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    write_archive(path, arrays, save=np.savez_compressed)
 
 
-if __name__ == "__main__":
+@errors_in_one_line()
+def _main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--count", type=int, default=36)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("path", type=archive_to_write)
+    parser.add_argument("--count", type=positive, default=36)
+    parser.add_argument("--seed", type=seed_number, default=0)
     parser.add_argument("--places", action="store_true", help="pieces of streets, rooms, roofs, trees and masts")
     options = parser.parse_args()
     what = SCANNED_PLACES if options.places else SCANNED_SOLIDS
     write_scanned(options.path, options.count, seed=options.seed, what=what)
+
+
+if __name__ == "__main__":
+    _main()

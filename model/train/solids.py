@@ -19,8 +19,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.normalize import CloudFrame
+from straightpcf.model.train.archive import write_archive
 from straightpcf.model.train.bodies import carving, creature
 from straightpcf.model.train.casings import CASINGS, UNSEEN
+from straightpcf.model.train.command import archive_to_write, errors_in_one_line, positive, seed_number
 from straightpcf.model.train.level_set import LevelSet
 from straightpcf.model.train.primitives import (
     Box,
@@ -73,7 +75,7 @@ def write_solids(
         if resolution not in wanted:
             arrays[f"{kind}{number:03d}/surface"] = xyz[kept].astype(np.float32)
         arrays[f"{kind}{number:03d}/normals"] = normals[kept].astype(np.float32)
-    np.savez_compressed(path, **arrays)
+    write_archive(path, arrays, save=np.savez_compressed)
 
 
 def _wall(rng: np.random.Generator) -> float:
@@ -230,14 +232,19 @@ KINDS: Mapping[str, Sequence[Callable[[np.random.Generator], Solid | LevelSet]]]
 }
 
 
-if __name__ == "__main__":
+@errors_in_one_line()
+def _main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--count", type=int, default=36)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("path", type=archive_to_write)
+    parser.add_argument("--count", type=positive, default=36)
+    parser.add_argument("--seed", type=seed_number, default=0)
     parser.add_argument("--kind", choices=tuple(KINDS), default="solid")
     parser.add_argument(
         "--resolutions", type=int, nargs="+", choices=RESOLUTIONS, help="those to train on, all by default"
     )
     options = parser.parse_args()
     write_solids(options.path, options.count, seed=options.seed, resolutions=options.resolutions, kind=options.kind)
+
+
+if __name__ == "__main__":
+    _main()

@@ -12,11 +12,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
+from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint, refuse_folder
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Average", "average_with", "load_state", "read_network", "save_state", "take_distance_module"]
+__all__ = ["Average", "average_with", "load_state", "read_header", "read_network", "save_state", "take_distance_module"]
 
 
 class Average:
@@ -58,11 +58,13 @@ def save_state(
     scratch = path.with_suffix(".tmp")
     try:
         save_file(tensors, scratch, metadata=metadata)
+        with scratch.open("rb+") as file:  # on the disk before it takes the old one's place
+            os.fsync(file.fileno())
+        scratch.replace(path)
     except SafetensorError as exc:
         raise OSError(f"{path} cannot be written: {exc}") from exc
-    with scratch.open("rb+") as file:  # on the disk before it takes the old one's place
-        os.fsync(file.fileno())
-    scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)  # half of one would keep a full disk full
 
 
 def load_state(
@@ -86,7 +88,7 @@ def load_state(
 
 def read_network(path: Path) -> tuple[StraightPCF, dict[str, Any]]:
     """Return the averaged network of a run's state, or that of shipped weights, and the run's progress."""
-    if "progress" not in _header(path):
+    if "progress" not in read_header(path):
         return load_checkpoint(path), dict(read_checkpoint(path)[1].get("training", {}))
     tensors, metadata = _read(path)
     average = _under(tensors, "average.")
@@ -117,14 +119,16 @@ def average_with(network: StraightPCF, path: Path, share: float = 0.5) -> dict[s
 
 
 def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    metadata = _header(path)
+    metadata = read_header(path)
     if "progress" not in metadata:
         raise MalformedFile(f"{path} is no training state: its header has no progress")
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
 
 
-def _header(path: Path) -> dict[str, str]:
+def read_header(path: Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file; a state's has `progress`."""
+    refuse_folder(path)
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}

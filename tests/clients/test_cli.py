@@ -185,9 +185,9 @@ def test_doctor_looks_for_what_pyproject_asks_for() -> None:
 def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     data, run = tmp_path / "shapes.npz", tmp_path / "run"
     np.savez(data, **{f"shape{i:02d}/1500": torus(1500, i).astype(np.float32) for i in range(11)})
-    for iterations in ("1", "2"):
+    for iterations, said in (("1", ""), ("2", ""), ("1", f"nothing to do: {run} is at iteration 1 or beyond\n")):
         done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", iterations, "--batch-size", "2")
-        assert done.returncode == 0, done.stderr
+        assert (done.returncode, done.stderr) == (0, said)
     rows = (run / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
 
@@ -242,6 +242,16 @@ def test_training_refuses_what_it_cannot_use_by_code(
     command = ["train", "vm", "--data", str(data), "--run-dir", str(tmp_path / "run"), *arguments]
     done = CliRunner().invoke(app, command)
     assert (done.exit_code, text in done.stderr) == (code, True), done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+def test_a_log_that_finds_no_room_is_told_with_the_place(tmp_path: Path) -> None:
+    np.savez(data := tmp_path / "shapes.npz", **{f"{name}/1500": torus(1500) for name in "abcdef"})  # type: ignore[arg-type]
+    (run := tmp_path / "run").mkdir()
+    (run / "log.csv").symlink_to("/dev/full")
+    done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", "1", "--batch-size", "1")
+    assert done.returncode == 3
+    assert done.stderr == f"error [invalid_request]: [Errno 28] No space left on device: '{run}'\n"
 
 
 def test_a_stage_without_the_one_before_is_a_usage_error(tmp_path: Path) -> None:

@@ -312,9 +312,9 @@ def test_a_server_of_another_kind_is_called_so(body: bytes, ask: Callable[[Clien
             ask(client)
 
 
-def test_a_timeout_ends_a_call_whatever_the_server_does(client: Client) -> None:
+def test_a_timeout_ends_a_call_whatever_the_server_does(client: Client, url: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:  # which accepts, and never answers
-        silent = Client(f"http://127.0.0.1:{listener.getsockname()[1]}")
+        silent = Client(f"{url.partition(':')[0]}://127.0.0.1:{listener.getsockname()[1]}")
         job = client.jobs.create(SMALL, iterations=1)
         there = Job(silent._transport, job.info)
         for ask in (partial(silent.denoise, SMALL), there.wait):

@@ -96,6 +96,40 @@ def test_a_file_that_has_changed_is_named_and_can_be_chosen_again(page: Any, sca
     page.wait_for_selector("#report:not([hidden])")
 
 
+def test_what_is_dropped_is_taken_or_explained(page: Any, scan: Path, tmp_path: Path) -> None:
+    (folder := tmp_path / "scans").mkdir()
+    _drop(page, "#drop", files=[str(folder)])
+    assert page.inner_text("#error").strip() == "scans is a folder; drop the files in it, one at a time."
+    assert page.inner_text("#chosen") == "Choose a file"
+    _drop(page, "#drop", files=[str(scan), str(folder.parent / "scan.ply")])
+    assert page.inner_text("#chosen") == "scan.ply"
+    assert "the first of 2 files, which go one at a time" in page.inner_text("#chosen-note")
+    assert page.is_hidden("#error")
+    page.fill("#seed", "")
+    _drop(page, "#seed", items=[{"mimeType": "text/plain", "data": "7"}])
+    assert page.input_value("#seed") == "7"
+
+
+def test_a_browser_that_keeps_nothing_for_a_page_denoises_all_the_same(page: Any, scan: Path) -> None:
+    denied = "get() { throw new DOMException('denied', 'SecurityError') }"
+    page.add_init_script(f"Object.defineProperty(window, 'sessionStorage', {{ {denied} }})")
+    page.reload()
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    assert "scan.ply" in page.inner_text("#jobs-list")
+
+
+def test_points_that_are_nan_are_no_error_to_the_console(page: Any, tmp_path: Path) -> None:
+    xyz = noisy(sphere(500), 0.01)
+    xyz[::3] = np.nan
+    np.save(path := tmp_path / "depth.npy", xyz)
+    page.set_input_files("#file", path)
+    page.wait_for_selector("#empty", state="hidden")
+    page.wait_for_timeout(300)  # a frame or two; the fixture looks at the console
+
+
 def test_a_canceled_job_is_no_error_and_the_next_one_is_shown_as_it_came_out(
     page: Any, scan: Path, tmp_path: Path
 ) -> None:
@@ -349,6 +383,16 @@ def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
     page.wait_for_timeout(500)  # a frame or two of the viewer
     lowest = (0x44 / 255, 0x01 / 255, 0x54 / 255)  # which fades with depth
     assert (np.abs(_picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
+
+
+def _drop(page: Any, where: str, *, files: list[str] | None = None, items: list[dict[str, str]] | None = None) -> None:
+    box = page.locator(where).bounding_box()
+    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    data = {"items": items or [], "files": files or [], "dragOperationsMask": 1}
+    chromium = page.context.new_cdp_session(page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        chromium.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})
+    page.wait_for_timeout(300)
 
 
 def _picture(page: Any) -> np.ndarray:

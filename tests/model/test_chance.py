@@ -9,6 +9,7 @@ import pytest
 
 from straightpcf.model.train.chance import write_chance
 from straightpcf.model.train.data import PatchSource
+from straightpcf.points.errors import InvalidOptions
 from tests.clouds import sphere
 
 
@@ -37,5 +38,5 @@ def test_the_finest_clouds_are_thinned_and_stand_for_the_surface(even: Path, tmp
 def test_more_points_than_there_are_or_fewer_than_a_patch_has_are_refused(
     even: Path, tmp_path: Path, count: int
 ) -> None:
-    with pytest.raises(ValueError, match=f"s0 can have 1000 to 4000 points, not {count}"):
+    with pytest.raises(InvalidOptions, match=f"s0 can have 1000 to 4000 points, not {count}"):
         write_chance(tmp_path / "chance.npz", even, [count])

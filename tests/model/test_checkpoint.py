@@ -26,6 +26,7 @@ from straightpcf.model.checkpoint import (
     save_checkpoint,
 )
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
+from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import MalformedFile
 
 SMALL = {"couplings": 2, "width": 16, "distance_width": 8}
@@ -236,3 +237,9 @@ def test_a_torch_file_without_tensors_is_refused(tmp_path: Path, content: Any) -
     torch.save(content, tmp_path / "a.pt")
     with pytest.raises(MalformedFile, match="state_dict"):
         load_official_checkpoint(tmp_path / "a.pt")
+
+
+def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
+    for read in (load_checkpoint, read_network):
+        with pytest.raises(IsADirectoryError, match=str(tmp_path)):
+            read(tmp_path)

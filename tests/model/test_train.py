@@ -307,6 +307,7 @@ def test_a_state_that_the_disk_has_no_room_for_is_a_files_error_and_the_old_one_
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert (tmp_path / "state.safetensors").read_bytes() == before
+    assert not (tmp_path / "state.tmp").exists()
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:

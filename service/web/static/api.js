@@ -1,5 +1,7 @@
 // Requests to the server this page came from, with the key if there is one, and its errors as one class.
 
+import { keep, kept } from "./session.js";
+
 const KEY = "straightpcf.key";
 
 export class Problem extends Error {
@@ -10,12 +12,11 @@ export class Problem extends Error {
 }
 
 export function apiKey() {
-  return sessionStorage.getItem(KEY) ?? "";
+  return kept(KEY) ?? "";
 }
 
 export function keepApiKey(key) {
-  if (key) sessionStorage.setItem(KEY, key);
-  else sessionStorage.removeItem(KEY);
+  keep(KEY, key || null);
 }
 
 export function url(path) {

@@ -4,25 +4,26 @@ import { element } from "./report.js";
 import * as text from "./text.js";
 
 export class Form {
-  // parts: the page's elements by id; onFile(file): one was chosen.
-  constructor(parts, onFile) {
+  // parts: the page's elements by id; onFile(file): one was chosen; onFault(line): what was dropped cannot be.
+  constructor(parts, onFile, onFault) {
     this.parts = parts;
     this.file = null;
     this.info = null;
-    const choose = (file) => {
+    const choose = ([file, ...more]) => {
       if (!file) return;
       this.file = file;
       parts.chosen.textContent = file.name;
-      parts["chosen-note"].textContent = `${text.bytes(file.size)} · choose another or drop it here`;
+      const others = more.length ? `the first of ${more.length + 1} files, which go one at a time` : "choose another or drop it here";
+      parts["chosen-note"].textContent = `${text.bytes(file.size)} · ${others}`;
       onFile(file);
     };
-    parts.file.addEventListener("change", () => choose(parts.file.files[0]));
+    parts.file.addEventListener("change", () => choose(parts.file.files));
     parts.file.addEventListener("click", () => (parts.file.value = "")); // else the same file again is no change
     parts.strength.addEventListener("input", () => this.showStrength());
     this.showStrength(); // browsers restore a form's values
     for (const kind of ["dragenter", "dragover"]) {
       addEventListener(kind, (event) => {
-        if (!event.dataTransfer?.types.includes("Files")) return;
+        if (!hasFiles(event)) return;
         event.preventDefault();
         parts.drop.classList.add("over");
       });
@@ -31,9 +32,13 @@ export class Form {
       if (!event.relatedTarget) parts.drop.classList.remove("over");
     });
     addEventListener("drop", (event) => {
+      if (!hasFiles(event)) return; // text goes where it is dropped
       event.preventDefault();
       parts.drop.classList.remove("over");
-      choose(event.dataTransfer.files[0]);
+      const { items, files } = event.dataTransfer;
+      const folder = [...items].map((item) => item.webkitGetAsEntry?.()).find((entry) => entry?.isDirectory);
+      if (folder) onFault(`${folder.name} is a folder; drop the files in it, one at a time.`);
+      else choose(files);
     });
   }
 
@@ -72,6 +77,10 @@ export class Form {
   showStrength() {
     this.parts["strength-value"].textContent = `${Math.round(100 * this.parts.strength.value)} %`;
   }
+}
+
+function hasFiles(event) {
+  return event.dataTransfer?.types.includes("Files") ?? false;
 }
 
 function fill(select, options) {

@@ -2,6 +2,7 @@
 
 import { call, json, pause } from "./api.js";
 import { element, offerDownload } from "./report.js";
+import { keep, kept } from "./session.js";
 import * as text from "./text.js";
 
 const KEY = "straightpcf.jobs";
@@ -14,7 +15,7 @@ const SAID = {
 };
 
 export function rememberJob(id) {
-  sessionStorage.setItem(KEY, JSON.stringify([id, ...known().filter((other) => other !== id)].slice(0, MOST)));
+  keep(KEY, JSON.stringify([id, ...known().filter((other) => other !== id)].slice(0, MOST)));
 }
 
 // An id for a job to be made. randomUUID would be one, but is for HTTPS and localhost alone.
@@ -107,5 +108,5 @@ function row(job, { name, again, onShow, onDeleted, onProblem }) {
 }
 
 function known() {
-  return JSON.parse(sessionStorage.getItem(KEY) ?? "[]");
+  return JSON.parse(kept(KEY) ?? "[]");
 }

@@ -15,7 +15,7 @@ const BETWEEN = ["connection_failed", "error"]; // codes of what is not the serv
 
 const parts = Object.fromEntries([...document.querySelectorAll("[id]")].map((part) => [part.id, part]));
 const stage = new Stage(parts);
-const form = new Form(parts, chosen);
+const form = new Form(parts, chosen, (detail) => showProblem(new Problem({ code: "", detail })));
 const files = new Map(); // the file of each job that was sent since the page was loaded
 let latest = { file: null, reading: null }; // the file that was read last, and the promise of what is in it
 let run = null; // {id, abort} while a job is sent or followed; id is null until the server has the file

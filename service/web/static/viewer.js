@@ -46,6 +46,7 @@ export class Viewer {
   constructor(canvas) {
     this.canvas = canvas;
     this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.sortObjects = false; // there is one; to sort it is to measure it, and NaN has no measure
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 100);
     this.centre = new Vector3();

@@ -1,0 +1,66 @@
+"""install.sh, with other programs in the place of those that would change this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="install.sh is for Debian and Ubuntu")
+
+# Makes of `-m venv` what the rest of the script calls; `$0.old` and `$0.bare` say what else it is.
+PYTHON = """#!/bin/bash
+case "$*" in
+  *version_info*) [ ! -e "$0.old" ] ;;
+  *ensurepip*) [ ! -e "$0.bare" ] ;;
+  *venv*) mkdir -p .venv/bin; for it in python pip straightpcf; do printf '#!/bin/bash\\n' > .venv/bin/$it; done
+          chmod +x .venv/bin/* ;;
+esac
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    shutil.copy(Path(__file__).parents[1] / "install.sh", tmp_path)
+    (tmp_path / "bin").mkdir()
+    dpkg = '#!/bin/bash\n[[ "$*" != *-venv ]]\n'
+    asked = f'#!/bin/bash\necho "$@" >> {tmp_path}/asked\n'
+    for name, text in {"python3.12": PYTHON, "dpkg": dpkg, "apt-get": asked, "sudo": '#!/bin/bash\n"$@"\n'}.items():
+        (path := tmp_path / "bin" / name).write_text(text)
+        path.chmod(0o755)
+    return tmp_path
+
+
+def install(folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHON": "python3.12"}
+    return subprocess.run(
+        ["bash", "install.sh"], cwd=folder, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_a_python_that_is_too_old_is_refused_and_leaves_no_environment(folder: Path) -> None:
+    (folder / "bin" / "python3.12.old").touch()
+    ended = install(folder)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("python3.12 is no Python 3.11 or newer")
+    assert not (folder / ".venv").exists()
+    (folder / "bin" / "python3.12.old").unlink()
+    assert install(folder).returncode == 0
+
+
+def test_an_environment_without_pip_is_made_again(folder: Path) -> None:
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    (python := folder / ".venv" / "bin" / "python").write_text("#!/bin/bash\n")
+    python.chmod(0o755)
+    assert install(folder).returncode == 0
+    assert (folder / ".venv" / "bin" / "pip").exists()
+
+
+def test_another_pythons_own_package_is_installed(folder: Path) -> None:
+    (folder / "bin" / "python3.12.bare").touch()
+    assert install(folder).returncode == 0
+    assert (folder / "asked").read_text().split()[-1] == "python3.12-venv"
