@@ -20,7 +20,7 @@ from straightpcf.model.kernels import cuda
 
 device = "cuda" if torch.cuda.is_available() else "cpu"
 generator = torch.Generator().manual_seed(0)
-for points, channels, k, rows in ((200, 3, 32, 90), (200, 3, 16, 31), (130, 32, 32, 70), (333, 64, 32, 41),
+for points, channels, k, rows in ((200, 3, 32, 23), (200, 3, 16, 9), (130, 32, 32, 15), (333, 64, 32, 9),
                                   (20, 3, 32, 20), (2, 3, 32, 2), (34, 16, 32, 34)):
     x = torch.randn(2, points, channels, generator=generator).to(device)
     found, expected = cuda.knn(x, k, rows).long(), ops.knn_torch(x, k, rows)
@@ -34,12 +34,12 @@ for points, channels, k, rows in ((200, 3, 32, 90), (200, 3, 16, 31), (130, 32, 
 for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     a, b = torch.randn(2, 2, 100, channels, generator=generator).to(device)
     weight = (torch.randn(out, channels, generator=generator) / channels**0.5).to(device)
-    index = ops.knn_torch(b, 32, 70)
-    found, expected = cuda.edge_max(a[:, :70], b, index.int(), weight), ops.edge_max_torch(a[:, :70], b, index, weight)
+    index = ops.knn_torch(b, 32, 22)
+    found, expected = cuda.edge_max(a[:, :22], b, index.int(), weight), ops.edge_max_torch(a[:, :22], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
-cuda._prove(torch.device(device), 1000 if device == "cuda" else 150)
+cuda._prove(torch.device(device), 1000 if device == "cuda" else 40)
 cloud = torch.randn(9000, 3, generator=generator).to(device)
-for wanted, first in ((1, 0), (20, 1), (20, 8999)):
+for wanted, first in ((1, 0), (8, 1), (8, 8999)):
     assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
 print("same")
 """
