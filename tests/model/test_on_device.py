@@ -58,7 +58,7 @@ def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) ->
 
 
 def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
-    cloud = noisy(torus(14_000), 0.01)
+    cloud = noisy(torus(11_000), 0.01)
     options = DenoiseOptions(iterations=2)
     expected = Filter(network, threads=1, coverage=3, tile_points=10_000).denoise(cloud, options)
     result = on_device(network, batch=16, tile_points=10_000).denoise(cloud, options)
