@@ -90,7 +90,7 @@ class _Client:
             time.sleep(0.02)
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_random_kills_lose_no_job_and_give_no_half_result(tmp_path: Path, kills: int) -> None:
     random = np.random.default_rng(kills)
     clouds = _clouds()
@@ -99,8 +99,8 @@ def test_random_kills_lose_no_job_and_give_no_half_result(tmp_path: Path, kills:
             httpx2.post(f"{server.url}/denoise?iterations=1", content=cloud, timeout=120).content for cloud in clouds
         ]
     client = _Client(clouds, expected)
-    # A quiet moment after so many kills; the fast test has a worker kill and a server kill.
-    victims = ["worker", "server"] if kills == 2 else list(random.choice(["server", "worker"], kills))
+    # A quiet moment after so many kills; the fast test has a server kill, a worker kill and a server kill.
+    victims = ["server", "worker", "server"] if kills == 3 else list(random.choice(["server", "worker"], kills))
     done = 0
     with client.reading():
         while done < kills:
