@@ -12,7 +12,6 @@ import numpy.typing as npt
 import torch
 
 from straightpcf.model.device import current, enough_memory
-from straightpcf.model.kernels import cuda
 from straightpcf.model.ops import squared_distances
 from straightpcf.model.patches import PATCH_SIZE, Patches
 
@@ -63,8 +62,11 @@ def _farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
     """Sample farthest points of (N, 3) float32, beginning with row `first`: (wanted,)."""
     if wanted >= len(points):
         return torch.arange(len(points), device=points.device)
-    if points.is_cuda and len(points) <= cuda.MOST_FARTHEST and cuda.load():
-        return cuda.farthest(points, wanted, first)
+    if points.is_cuda:
+        from straightpcf.model.kernels import cuda
+
+        if len(points) <= cuda.MOST_FARTHEST and cuda.load():
+            return cuda.farthest(points, wanted, first)
     return farthest_torch(points, wanted, first)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from straightpcf.model.kernels import cpu, cuda
+from straightpcf.model.kernels import cpu
 
 __all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "squared_distances"]
 
@@ -17,8 +17,11 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
     the farthest.
     """
     rows = x.shape[1] if rows is None else rows
-    if x.is_cuda and x.shape[1] <= cuda.MOST_POINTS and cuda.load():
-        return cuda.knn(x.detach(), k, rows)
+    if x.is_cuda:
+        from straightpcf.model.kernels import cuda
+
+        if x.shape[1] <= cuda.MOST_POINTS and cuda.load():
+            return cuda.knn(x.detach(), k, rows)
     library = cpu.load() if x.device.type == "cpu" and x.dtype == torch.float32 and k <= 64 else None
     return knn_torch(x, k, rows) if library is None else cpu.knn(library, x, k, rows)
 
@@ -56,10 +59,14 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     index: (B, M, k) into P; weight: (D, C). Returns (B, M, D): max_n weight @ relu(a_i + b_index[i, n]).
     """
     want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
-    if a.is_cuda and not want_grad and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0 and cuda.load():
-        return cuda.edge_max(a, b, index.int(), weight)
-    plain = a.dtype == torch.float32 and a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
-    library = cpu.load() if plain and a.device.type == "cpu" and index.dtype == torch.int32 else None
+    whole = a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
+    if a.is_cuda and whole and not want_grad:
+        from straightpcf.model.kernels import cuda
+
+        if cuda.load():
+            return cuda.edge_max(a, b, index.int(), weight)
+    plain = whole and a.dtype == torch.float32 and index.dtype == torch.int32
+    library = cpu.load() if plain and a.device.type == "cpu" else None
     if library is None:
         return edge_max_torch(a, b, index, weight)
     return cpu.EdgeMax.apply(library, a, b, index, weight, want_grad)  # type: ignore[no-untyped-call,no-any-return]

@@ -76,7 +76,15 @@ def test_the_wheel_holds_nothing_else(wheel: list[str]) -> None:
     assert not [name for name in wheel if "resume" in name or name.endswith((".so", ".pyc"))]
 
 
-@pytest.mark.parametrize("module", ["straightpcf.clients.sdk", "straightpcf.points.formats", "straightpcf.service.app"])
-def test_importing_it_brings_no_torch(module: str) -> None:
-    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("straightpcf.clients.sdk", "torch"),
+        ("straightpcf.points.formats", "torch"),
+        ("straightpcf.service.app", "torch"),
+        ("straightpcf.model.filter", "triton"),  # of no use to a CPU
+    ],
+)
+def test_importing_it_does_not_bring_what_is_heavy(module: str, heavy: str) -> None:
+    code = f"import sys, {module}; sys.exit({heavy!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=False).returncode == 0
