@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from straightpcf.model.kernels import cpu
 from tests.clouds import sphere
 
 ROOT = Path(__file__).parent.parent
+
+Refused = Callable[..., tuple[int, str]]
 
 
 def printed(name: str, *arguments: object) -> str:
@@ -39,6 +43,22 @@ def _run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         timeout=120,
         check=False,
     )
+
+
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """Run a command that ends before its work, here; return its exit code and what it says on stderr."""
+
+    def run(name: str, *arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            importlib.import_module(f"benchmarks.{name}").main()
+        said, code = capsys.readouterr(), ended.value.code
+        if isinstance(code, str):  # which Python prints, and exits with 1
+            return 1, said.err + code
+        return int(code or 0), said.err
+
+    return run
 
 
 def test_quality(tmp_path: Path) -> None:
@@ -168,19 +188,19 @@ def test_points_that_an_archive_lacks_are_named_in_one_line(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["held_out", "passes", "velocities", "quality", "calibrate"])
-def test_a_file_that_is_missing_is_named_in_one_line(name: str, tmp_path: Path) -> None:
+def test_a_file_that_is_missing_is_named_in_one_line(refused: Refused, name: str, tmp_path: Path) -> None:
     gone = tmp_path / "gone.safetensors"
     options: dict[str, tuple[object, ...]] = {
         "calibrate": ("--state", gone),
         "quality": ("--split", "validation", "--weights", gone),
     }
-    ended = _run(name, *options.get(name, (gone, "--data", tmp_path / "gone.npz")))
-    assert ended.returncode == 1
-    (line,) = ended.stderr.splitlines()
+    code, said = refused(name, *options.get(name, (gone, "--data", tmp_path / "gone.npz")))
+    assert code == 1
+    (line,) = said.splitlines()
     assert str(tmp_path) in line
 
 
-def test_an_archive_or_weights_that_cannot_be_read_are_named_in_one_line(tmp_path: Path) -> None:
+def test_an_archive_or_weights_that_cannot_be_read_are_named_in_one_line(refused: Refused, tmp_path: Path) -> None:
     (junk := tmp_path / "junk.npz").write_text("junk")
     np.savez(tmp_path / "punet_test.npz", **{"a/10000": np.zeros((3, 3))})
     for name, *arguments in (
@@ -190,23 +210,24 @@ def test_an_archive_or_weights_that_cannot_be_read_are_named_in_one_line(tmp_pat
         ("quality", "--split", "validation", "--weights", tmp_path),
         ("quality", "--split", "punet", "--data", tmp_path, "--resolution", 7),
     ):
-        ended = _run(str(name), *arguments)
-        assert ended.returncode == 1
-        (line,) = ended.stderr.splitlines()
+        code, said = refused(str(name), *arguments)
+        assert code == 1
+        (line,) = said.splitlines()
         assert str(tmp_path) in line
 
 
 @pytest.mark.parametrize("arguments", ["speed --patches 0", "speed --threads 0", "quality --resolution 0"])
-def test_a_count_of_nothing_is_a_usage_error(arguments: str) -> None:
-    ended = _run(*arguments.split())
-    assert ended.returncode == 2
-    assert "0 is no whole number of 1 or more" in ended.stderr.splitlines()[-1]
+def test_a_count_of_nothing_is_a_usage_error(refused: Refused, arguments: str) -> None:
+    code, said = refused(*arguments.split())
+    assert code == 2
+    assert "0 is no whole number of 1 or more" in said.splitlines()[-1]
 
 
-def test_where_weights_cannot_be_written_is_said_before_they_are_made(tmp_path: Path) -> None:
-    ended = _run("calibrate", "--state", tmp_path / "none", "--out", tmp_path / "gone" / "weights.safetensors")
-    assert ended.returncode == 2
-    assert "is no folder to write weights.safetensors to" in ended.stderr.splitlines()[-1]
+def test_where_weights_cannot_be_written_is_said_before_they_are_made(refused: Refused, tmp_path: Path) -> None:
+    gone = tmp_path / "gone" / "weights.safetensors"
+    code, said = refused("calibrate", "--state", tmp_path / "none", "--out", gone)
+    assert code == 2
+    assert "is no folder to write weights.safetensors to" in said.splitlines()[-1]
 
 
 def test_noise_that_is_no_number_is_a_usage_error() -> None:

@@ -23,23 +23,29 @@ FLAGS = (
 )  # fmt: skip
 
 
-@pytest.fixture
-def page(server: RunningServer) -> Iterator[Any]:
-    """The page, loaded; fails the test on any error in its console."""
+@pytest.fixture(scope="module")  # not longer: while Playwright runs, asyncio.run in other tests is refused
+def browser() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api")
     if CHROMIUM is None:
         pytest.skip("no Chromium here: apt-get install chromium")
     with playwright.sync_playwright() as browsers:
         browser = browsers.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": 1200, "height": 800})
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser: Any, server: RunningServer) -> Iterator[Any]:
+    """The page, loaded, in a profile of its own; fails the test on any error in its console."""
+    with browser.new_context(viewport={"width": 1200, "height": 800}) as profile:
+        page = profile.new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         # A refused request is an error to the console, and what this page is there to explain.
         page.on("console", lambda said: errors.append(said.text) if _is_fault(said) else None)
         page.goto(server.url)
         yield page
-        browser.close()
-        assert not errors
+    assert not errors
 
 
 @pytest.fixture
