@@ -31,4 +31,6 @@ if [ "$torch" = cpu ] && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
     --index-url https://download.pytorch.org/whl/cpu 2>/dev/null || true
 fi
 .venv/bin/pip install -q -e '.[dev]'
+# pip compiles what it copies, not what it links to; where PYTHONDONTWRITEBYTECODE is set nothing else would.
+.venv/bin/python -m compileall -q src
 .venv/bin/straightpcf version
