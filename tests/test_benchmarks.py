@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,19 @@ def test_passes(tmp_path: Path) -> None:
     assert (noise, number) == (0.02, 1)
     assert chamfer > across > sunk
     assert 0 < across < 4  # the noise's own is 4
+
+
+@pytest.mark.parametrize("name", ["quality", "speed", "kernels"])
+def test_a_device_is_named_as_the_filter_takes_it(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = import_module(f"benchmarks.{name}")
+    for device, said in (("cuda:99", "cuda:99 was asked for, and torch sees"), ("tpu", "'tpu'; it must be")):
+        monkeypatch.setattr(sys, "argv", [name, "--device", device])
+        with pytest.raises(SystemExit) as end:
+            module.main()
+        assert end.value.code == 2
+        assert said in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_kernels_that_cannot_be_compiled_are_not_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
