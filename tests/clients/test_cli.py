@@ -65,6 +65,8 @@ def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: 
     [
         (["denoise", "IN", "OUT.npy", "--iterations", "0"], 2, "error [invalid_options]"),
         (["denoise", "IN", "OUT.npy", "--device", "tpu"], 2, "tpu"),
+        (["denoise", "IN", "OUT.npy", "--device", "cuda:99"], 4, "cuda:99"),
+        (["watch", ".", "--once", "--device", "cuda:99"], 4, "cuda:99"),
         (["denoise", "IN"], 2, "OUT"),
         (["denoise", "IN", "OUT.gif"], 3, "error [unknown_format]"),
         (["denoise", "missing.npy", "OUT.npy"], 3, "missing.npy"),
