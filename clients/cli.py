@@ -275,7 +275,7 @@ def version() -> None:
 def train(
     stage: Annotated[Stage, typer.Argument(help="vm: one velocity module; cvm: the coupled stack; dm: the distance.")],
     data: Annotated[list[Path], typer.Option(help=_TRAINING_DATA)],
-    run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that is found there is resumed.")],
+    run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that ended there is resumed.")],
     iterations: Annotated[int, typer.Option(min=1)] = 20_000,
     batch_size: Annotated[int, typer.Option(min=1)] = 16,
     learning_rate: Annotated[float, typer.Option(min=0.0, help="At its peak.")] = 1e-3,
