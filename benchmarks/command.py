@@ -1,4 +1,4 @@
-"""What the commands share: an error that a user can mend is one line, a level of noise is a number, a device is here."""
+"""What the commands share: an error that a user can mend is one line, a level of noise a number, a device here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["device", "errors_in_one_line", "file_to_write", "noise_level", "posi
 
 
 def device(text: str) -> str:
-    """Read a device, for argparse, as the filter does: one that is not here is found out before anything is measured."""
+    """Read a device, for argparse, as the filter does: one that is not here is found out before the work."""
     try:
         return device_named(text)
     except DeviceUnavailable as error:
