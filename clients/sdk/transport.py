@@ -207,6 +207,16 @@ class Transport(_Patience, ABC):
 class AsyncTransport(_Patience, ABC):
     """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
 
+    _loop: asyncio.AbstractEventLoop | None = None
+
+    def check_open(self) -> None:
+        """Raise InvalidRequest also in another event loop than that of the first call, where connections belong."""
+        super().check_open()
+        loop = asyncio.get_running_loop()
+        self._loop = self._loop or loop
+        if loop is not self._loop:
+            raise InvalidRequest("this client belongs to another event loop, that of its first call: make one in each")
+
     @abstractmethod
     async def close(self) -> None:
         """Close the connections."""
