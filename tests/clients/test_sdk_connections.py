@@ -254,6 +254,17 @@ def test_an_event_of_another_server_is_told_as_such(said: str, server: RunningSe
             list(proxied.events())
 
 
+def test_patches_of_another_server_are_told_as_such(server: RunningServer) -> None:
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(400), 0.01), iterations=1)
+        told = canned("200 OK", json.dumps(job.info.json))
+    login = canned("200 OK", "<html>please log in</html>", "Content-Type: text/html")
+    with answering(told, login) as (url, _), Client(url, max_retries=0) as client:
+        proxied = client.jobs.get(job.id)
+        with pytest.raises(ConnectionFailed, match="no patches of a StraightPCF server"):
+            list(proxied.patches())
+
+
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
     moved = canned("301 Moved Permanently", "", "Location: https://clouds.example/healthz")
     refused = pytest.raises(InvalidRequest, match=r"https://clouds\.example/healthz")
