@@ -335,7 +335,7 @@ def train(
 
 @app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """Check what this machine has: Python, torch, devices, weights, extras. Exits 4 if denoising cannot work."""
+    """Check what this machine has: Python, torch, devices, kernels, weights, extras. Exits 4 if it cannot denoise."""
     from straightpcf.clients.doctor import examine
 
     findings, healthy = examine()

@@ -18,6 +18,7 @@ import straightpcf
 from straightpcf.clients.cli import app
 from straightpcf.clients.console import EXIT_CODES, exit_code
 from straightpcf.clients.doctor import EXTRAS
+from straightpcf.model.kernels import cpu
 from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
@@ -173,6 +174,19 @@ def test_doctor_tells_what_is_here() -> None:
     findings = json.loads(done.stdout)
     assert {"python", "extras"} <= set(findings)
     assert done.exit_code == (4 if "problem" in findings else 0)
+
+
+def test_doctor_says_why_there_are_no_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if cpu._SHIPPED.is_dir():
+        pytest.skip("the kernels are shipped here")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))  # no compiler
+    cpu.load.cache_clear()
+    try:
+        done = CliRunner().invoke(app, ["doctor", "--json"])
+    finally:
+        cpu.load.cache_clear()
+    assert "no C++ compiler: install g++" in json.loads(done.stdout)["kernels"]
 
 
 def test_doctor_looks_for_what_pyproject_asks_for() -> None:
