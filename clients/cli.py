@@ -282,7 +282,7 @@ def train(
     rows: Annotated[int, typer.Option(min=1, max=1000, help="Points of a patch in the loss.")] = 256,
     couplings: Annotated[int, typer.Option(min=1, max=8, help="K, the velocity modules of the stack.")] = 2,
     euler_steps: Annotated[int, typer.Option(min=1, max=8, help="N of the pass that cvm is trained on.")] = 1,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
     device: Annotated[str, typer.Option(metavar=_DEVICES)] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="On a CPU, to share each batch.")] = 1,

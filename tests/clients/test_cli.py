@@ -249,6 +249,7 @@ if __name__ == "__main__":
         ({"a": torus(1500)}, [], 3, "malformed_file"),
         ({"a/1": torus(500)}, [], 3, "too_few_points"),
         ({"a/1": torus(1500)}, ["--device", "cuda:99"], 4, "device_unavailable"),
+        ({"a/1": torus(1500)}, ["--seed", "9223372036854775808"], 2, "--seed"),
     ],
 )
 def test_training_refuses_what_it_cannot_use_by_code(
