@@ -34,8 +34,7 @@ except ImportError as exc:
 __all__ = ["AsyncGrpcTransport", "GrpcTransport"]
 
 _SHORT = frozenset(("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth"))
-_NEVER_SILENT = frozenset((UPLOAD, "DownloadResult"))
-# A dead peer is noticed by pings, so that a stream may be silent for as long as its job waits.
+# A dead peer is noticed by pings before the silence is too long.
 _OPTIONS = (("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000))
 
 
@@ -63,7 +62,7 @@ class GrpcTransport(Transport):
         upload = Upload(call, silence) if call.rpc == UPLOAD else None
         try:
             answer = Answer(call, receiver)
-            with closing(self._messages(call, upload or request_of(call, receiver), silence)) as messages:
+            with closing(self._messages(call, upload or request_of(call, receiver), silence, attempts)) as messages:
                 for message in messages:
                     answer.take(message)
                     yield
@@ -73,7 +72,7 @@ class GrpcTransport(Transport):
                 raise upload.error from None
             attempts.failure = _failed(error, silence, self._url)
 
-    def _messages(self, call: Call, send: Any, silence: Silence) -> Generator[Any]:
+    def _messages(self, call: Call, send: Any, silence: Silence, attempts: Attempts) -> Generator[Any]:
         ask, how = getattr(self._stub, call.rpc), _how(call, self._key, self.timeout)
         if call.rpc in _SHORT:
             yield ask(send, **how)
@@ -84,6 +83,8 @@ class GrpcTransport(Transport):
         else:
             coming = ask(send, **how)
             with silence.watched(coming):
+                if coming.initial_metadata():  # which a server that hangs does not send
+                    attempts.answered()
                 for message in coming:
                     silence.ours()
                     yield message
@@ -113,7 +114,7 @@ class AsyncGrpcTransport(AsyncTransport):
         try:
             answer = Answer(call, receiver)
             send = request_of(call, receiver) if upload is None else _asynchronous(upload)
-            async with aclosing(self._messages(call, send, silence)) as messages:
+            async with aclosing(self._messages(call, send, silence, attempts)) as messages:
                 async for message in messages:
                     answer.take(message)
                     yield
@@ -129,10 +130,12 @@ class AsyncGrpcTransport(AsyncTransport):
                     raise
             attempts.failure = _failed(error, silence, self._url)
 
-    async def _messages(self, call: Call, send: Any, silence: Silence) -> AsyncGenerator[Any]:
+    async def _messages(self, call: Call, send: Any, silence: Silence, attempts: Attempts) -> AsyncGenerator[Any]:
         coming = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
         async with silence.watched_here(coming):
             if hasattr(coming, "__aiter__"):
+                if await coming.initial_metadata():
+                    attempts.answered()
                 async for message in coming:
                     silence.ours()
                     yield message
@@ -168,7 +171,7 @@ def _how(call: Call, api_key: str | None, timeout: float | None) -> dict[str, An
 
 
 def _silence_in(call: Call, timeout: float | None) -> Silence:
-    return Silence(call.patience(timeout) if call.rpc in _NEVER_SILENT else None)
+    return Silence(None if call.rpc in _SHORT else call.patience(timeout))
 
 
 def _failed(error: BaseException, silence: Silence, url: str) -> Failure:

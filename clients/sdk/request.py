@@ -207,8 +207,9 @@ def events_call(id: str) -> Call:
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
     path = _job(id, "events")
     return Call(
-        method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True, silence=STREAM_SECONDS
-    )
+        method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True,
+        silence=STREAM_SECONDS, may_wait=True,
+    )  # fmt: skip
 
 
 def patches_call(id: str) -> Call:

@@ -112,7 +112,7 @@ class Attempts:
         self._patience = patience if call.body is None else 0.0
         self._attempt, self._furthest = 0, receiver.furthest
         self._since, self._until = math.nan, call.until
-        self._held_seconds = min(_HELD_SECONDS, call.silence) if call.may_wait else None
+        self._held_seconds = min(_HELD_SECONDS, call.silence / 2) if call.may_wait else None
         self._answered: float | None = None
         self.failure: Failure | None = None
 

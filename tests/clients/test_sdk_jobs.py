@@ -167,7 +167,7 @@ def test_a_short_timeout_is_no_limit_to_a_job_that_waits_its_turn(url: str, monk
         assert [other.result(timeout=60) for other in others] == [400, 400, 400, 400]
 
 
-def test_patches_of_a_job_that_waits_long_are_waited_for(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_and_patches_of_a_job_that_waits_long_are_waited_for(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
     monkeypatch.setattr("straightpcf.clients.sdk.request.STREAM_SECONDS", 0.3)
 
@@ -180,8 +180,10 @@ def test_patches_of_a_job_that_waits_long_are_waited_for(url: str, monkeypatch: 
         job = hasty.jobs.create(SMALL, iterations=1)
         with ThreadPoolExecutor() as pool:
             also = pool.submit(asyncio.run, there(job.id))
+            told = pool.submit(lambda: list(job.events()))
             pool.submit(lambda: (time.sleep(2.5), first.cancel()))
             assert sum(len(frame.indices) for frame in job.patches()) == also.result() == 400
+            assert [event.id for event in told.result()] == list(range(1, 1 + len(told.result())))
         first.delete()
 
 

@@ -14,7 +14,7 @@ import grpc
 import numpy as np
 import pytest
 
-from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, Job, request
 from straightpcf.clients.sdk.job_info import JobInfo
 from straightpcf.clients.sdk.silence import Silence
 from straightpcf.points.errors import ConnectionFailed
@@ -49,6 +49,10 @@ class Hanging(DenoiseServiceServicer):  # type: ignore[misc]
         self.may_end.wait(30)
         return pb.Job()
 
+    def WatchJob(self, request: Any, context: Any) -> Iterator[pb.JobEvent]:  # noqa: N802
+        self.may_end.wait(30)
+        yield from ()
+
     def DownloadResult(self, request: Any, context: Any) -> Iterator[pb.DownloadResultResponse]:  # noqa: N802
         yield pb.DownloadResultResponse(result=pb.ResultInfo(bytes=10, sha256="0" * 64))
         self.may_end.wait(30)
@@ -71,19 +75,30 @@ def url(request: pytest.FixtureRequest) -> Iterator[str]:
     server.stop(grace=0).wait()
 
 
-@pytest.mark.parametrize("call", ["small", "large", "result"])
+@pytest.mark.parametrize("call", ["small", "large", "result", "events"])
 @pytest.mark.parametrize("is_async", [False, True])
-def test_a_server_that_hangs_is_given_up_after_the_timeout(url: str, call: str, *, is_async: bool) -> None:
+def test_a_server_that_hangs_is_given_up_after_the_timeout(
+    url: str, call: str, monkeypatch: pytest.MonkeyPatch, *, is_async: bool
+) -> None:
+    monkeypatch.setattr(request, "STREAM_SECONDS", 0.4)
     job = JobInfo.parse(SUCCEEDED)
     cloud = SMALL if call == "small" else LARGE
 
     async def ask_there() -> None:
         async with AsyncClient(url, timeout=0.4, max_retries=0) as client:
-            await (AsyncJob(client._transport, job).result() if call == "result" else client.jobs.create(cloud))
+            there = AsyncJob(client._transport, job)
+            if call == "events":
+                _ = [event async for event in there.events()]
+            else:
+                await (there.result() if call == "result" else client.jobs.create(cloud))
 
     def ask() -> None:
         with Client(url, timeout=0.4, max_retries=0) as client:
-            _ = Job(client._transport, job).result() if call == "result" else client.jobs.create(cloud)
+            there = Job(client._transport, job)
+            if call == "events":
+                list(there.events())
+            else:
+                _ = there.result() if call == "result" else client.jobs.create(cloud)
 
     began = time.monotonic()
     with pytest.raises(ConnectionFailed):
