@@ -22,6 +22,7 @@ from straightpcf.clients.console import (
     asked_to_stop,
     complain,
     ended_in_a_line,
+    forgiving_stderr,
     interruptible,
     needs,
     print_json,
@@ -87,6 +88,7 @@ def main() -> None:
     """Run the command line."""
     if sys.stdout is not None:  # a name that its encoding does not have is no error
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    forgiving_stderr()
     with quiet_end():
         app(prog_name="straightpcf")
 
