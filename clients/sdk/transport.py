@@ -124,7 +124,7 @@ class Attempts:
     def delay(self) -> float:
         """Return the seconds to wait before the next attempt, or raise what the last one met."""
         assert self.failure is not None
-        if self._was_held():
+        if self._was_held() and self.failure.retryable:
             self._attempt = 0
             return FIRST_DELAY_SECONDS
         if self._receiver.furthest > self._furthest:
