@@ -9,7 +9,8 @@ RUN apt-get update \
     && apt-get install -y --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
 # The public index serves CUDA builds of torch, PyTorch's own the CPU build.
-RUN python -m venv /venv \
+RUN case "$TORCH" in cpu|cuda) ;; *) echo "TORCH is $TORCH; it must be cpu or cuda" >&2; exit 1 ;; esac \
+    && python -m venv /venv \
     && if [ "$TORCH" = cpu ]; then \
         /venv/bin/pip install --no-cache-dir "torch>=2.6,<2.14" --index-url https://download.pytorch.org/whl/cpu; \
     fi

@@ -4,6 +4,11 @@
 set -euo pipefail
 cd "$(dirname "$0")"
 
+torch=${STRAIGHTPCF_TORCH:-$(command -v nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)}
+if [ "$torch" != cpu ] && [ "$torch" != cuda ]; then # a typing error would be a download of several GB
+  echo "STRAIGHTPCF_TORCH is $torch; it must be cpu or cuda" >&2
+  exit 1
+fi
 need=(g++ curl)                       # g++ compiles the CPU kernels at first use; the tests call curl
 python=${PYTHON:-python3}
 "$python" -c 'import venv, ensurepip' 2>/dev/null || need+=("$(basename "$python")-venv") # it brings python3, too
@@ -23,7 +28,6 @@ if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
   exit 1
 fi
 [ -x .venv/bin/pip ] || "$python" -m venv .venv # without pip it was left by a run that failed
-torch=${STRAIGHTPCF_TORCH:-$(command -v nvidia-smi >/dev/null 2>&1 && echo cuda || echo cpu)}
 if [ "$torch" = cpu ] && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
   # The public index serves CUDA builds of torch; PyTorch's own serves the CPU build. Where that one cannot be
   # reached, the index in use decides.
@@ -33,4 +37,7 @@ fi
 .venv/bin/pip install -q -e '.[dev]'
 # pip compiles what it copies, not what it links to; where PYTHONDONTWRITEBYTECODE is set nothing else would.
 .venv/bin/python -m compileall -q src
+if [ "$torch" = cuda ] && ! .venv/bin/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)'; then
+  echo "the torch in .venv has no CUDA, and stays: for another one, remove .venv and install anew" >&2
+fi
 .venv/bin/straightpcf version

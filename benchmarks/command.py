@@ -1,13 +1,23 @@
-"""What the commands share: an error that a user can mend is one line, and a level of noise is a number."""
+"""What the commands share: an error that a user can mend is one line, a level of noise a number, a device here."""
 
 from __future__ import annotations
 
 import argparse
 import math
 
+from straightpcf.model.filter import device_named
 from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
+from straightpcf.points.errors import DeviceUnavailable
 
-__all__ = ["errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
+__all__ = ["device", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
+
+
+def device(text: str) -> str:
+    """Read a device, for argparse, as the filter does: one that is not here is found out before the work."""
+    try:
+        return device_named(text)
+    except DeviceUnavailable as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def noise_level(text: str) -> float:

@@ -15,6 +15,7 @@ from unittest import mock
 
 import torch
 
+from benchmarks.command import device as device_here
 from benchmarks.speed import finish
 from straightpcf.model import ops
 from straightpcf.model.allocator import keep_large_buffers
@@ -28,7 +29,7 @@ OWNED = 334  # of a patch's points at 3-fold coverage
 def main() -> None:
     """Print a row per operation."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help='"cpu" (the default) or "cuda"')
+    parser.add_argument("--device", type=device_here, default="cpu", help='"cpu" (the default), "cuda" or "cuda:N"')
     parser.add_argument("--every-set", action="store_true", help="the CPU's instruction sets, one by one, instead")
     arguments = parser.parse_args()
     device = arguments.device
@@ -48,6 +49,8 @@ def main() -> None:
 
     torch.set_num_threads(1)
     keep_large_buffers()
+    if ":" in device:  # Triton launches on the current one
+        torch.cuda.set_device(device)
     torch.set_default_device(device)
     generator = torch.Generator(device).manual_seed(0)
     patch = torch.randn(patches, POINTS, 3, generator=generator) * 0.2

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from benchmarks.command import errors_in_one_line, noise_level, positive, seed_number
+from benchmarks.command import device, errors_in_one_line, noise_level, positive, seed_number
 from benchmarks.conventional import jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
@@ -252,7 +252,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--shapes", nargs="+", help="only these")
     parser.add_argument("--model", choices=("ours", "official", "jet", "noisy"), default="ours")
     parser.add_argument("--weights", type=Path, help="other weights, or the state of a training run")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--device", type=device, default="auto", help='"auto" (the default), "cpu", "cuda" or "cuda:N"')
     parser.add_argument("--threads", type=positive, help="CPU threads, all by default")
     parser.add_argument("--seed", type=seed_number, default=0, help="of made noise and of the filter")
     parser.add_argument("--data", type=Path, default=SHARED / "data")

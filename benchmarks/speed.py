@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, positive
+from benchmarks.command import device, errors_in_one_line, positive
 from benchmarks.quality import SHARED
 from benchmarks.shapes import Shape, analytic, make_noise, punet
 from straightpcf.model.cpus import usable_cpus
@@ -231,7 +231,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--resolution", type=positive, nargs="+", default=[10000, 50000])
     parser.add_argument("--iterations", type=positive, default=1, help="passes of both")
     parser.add_argument("--threads", type=positive, default=usable_cpus())
-    parser.add_argument("--device", default="cpu", help='"cpu" (the default) or "cuda"')
+    parser.add_argument("--device", type=device, default="cpu", help='"cpu" (the default), "cuda" or "cuda:N"')
     parser.add_argument(
         "--patches",
         type=lambda text: None if text == "all" else positive(text),

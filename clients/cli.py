@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import typer
 from typer.core import TyperGroup
@@ -21,6 +22,7 @@ from straightpcf.clients.console import (
     asked_to_stop,
     complain,
     ended_in_a_line,
+    forgiving_stderr,
     interruptible,
     needs,
     print_json,
@@ -35,14 +37,6 @@ from straightpcf.clients.stdio import STDIO, input_file, input_name, output_file
 from straightpcf.points import errors
 
 __all__ = ["app", "main"]
-
-
-class Device(StrEnum):
-    """Name what to compute on."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
 
 
 class Stage(StrEnum):
@@ -67,6 +61,15 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
 
+def _device(text: str) -> str:
+    """Refuse what is the name of no device, without the seconds that it takes to look for one."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
+        raise typer.BadParameter(f"{text!r} is none of auto, cpu, cuda and cuda:N.")
+    return text
+
+
+_DEVICES = "auto|cpu|cuda|cuda:N"
+Device: TypeAlias = Annotated[str, typer.Option(parser=_device, metavar=_DEVICES, help="What to compute on.")]
 _TRAINING_DATA = "Clean clouds: an NPZ of (N, 3) floats, N >= 1000, called <shape>/<resolution>; may be given again."
 
 app = typer.Typer(
@@ -85,6 +88,7 @@ def main() -> None:
     """Run the command line."""
     if sys.stdout is not None:  # a name that its encoding does not have is no error
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    forgiving_stderr()
     with quiet_end():
         app(prog_name="straightpcf")
 
@@ -110,7 +114,7 @@ def denoise(
     source: Annotated[Path, typer.Argument(metavar="IN", help="The noisy cloud; - for stdin.")],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; its suffix says how; - for stdout.")],
     iterations: Iterations = "auto",
-    device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
+    device: Device = "auto",
     seed: Seed = 0,
     strength: Strength = 1.0,
     normals: Normals = "keep",
@@ -167,7 +171,7 @@ def watch(
     seed: Seed = 0,
     strength: Strength = 1.0,
     normals: Normals = "keep",
-    device: Annotated[Device, typer.Option(help="What to compute on.")] = Device.auto,
+    device: Device = "auto",
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; by default one for each CPU.")] = None,
     url: Annotated[str | None, typer.Option(metavar="URL", help="Let this server do it, not this process.")] = None,
@@ -273,15 +277,15 @@ def version() -> None:
 def train(
     stage: Annotated[Stage, typer.Argument(help="vm: one velocity module; cvm: the coupled stack; dm: the distance.")],
     data: Annotated[list[Path], typer.Option(help=_TRAINING_DATA)],
-    run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that is found there is resumed.")],
+    run_dir: Annotated[Path, typer.Option(help="Checkpoints and log; a run that ended there is resumed.")],
     iterations: Annotated[int, typer.Option(min=1)] = 20_000,
     batch_size: Annotated[int, typer.Option(min=1)] = 16,
     learning_rate: Annotated[float, typer.Option(min=0.0, help="At its peak.")] = 1e-3,
     rows: Annotated[int, typer.Option(min=1, max=1000, help="Points of a patch in the loss.")] = 256,
     couplings: Annotated[int, typer.Option(min=1, max=8, help="K, the velocity modules of the stack.")] = 2,
     euler_steps: Annotated[int, typer.Option(min=1, max=8, help="N of the pass that cvm is trained on.")] = 1,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    device: Annotated[str, typer.Option(metavar="cpu|cuda")] = "cpu",
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
+    device: Annotated[str, typer.Option(metavar=_DEVICES)] = "cpu",
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="On a CPU, to share each batch.")] = 1,
     init: Annotated[Path | None, typer.Option(help="The state to start from.")] = None,
@@ -333,7 +337,7 @@ def train(
 
 @app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """Check what this machine has: Python, torch, devices, weights, extras. Exits 4 if denoising cannot work."""
+    """Check what this machine has: Python, torch, devices, kernels, weights, extras. Exits 4 if it cannot denoise."""
     from straightpcf.clients.doctor import examine
 
     findings, healthy = examine()
@@ -345,19 +349,19 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 job_commands.install(app)
 
 
-def _check_where(url: str | None, device: Device, weights: Path | None, threads: int | None) -> None:
-    if url is not None and (device != Device.auto or weights is not None or threads is not None):
+def _check_where(url: str | None, device: str, weights: Path | None, threads: int | None) -> None:
+    if url is not None and (device != "auto" or weights is not None or threads is not None):
         raise errors.InvalidOptions("--device, --weights and --threads are for this process; the server has its own")
 
 
-def _in_process(device: Device, weights: Path | None, threads: int | None) -> Callable[..., Any]:
+def _in_process(device: str, weights: Path | None, threads: int | None) -> Callable[..., Any]:
     """Load the filter and return what denoises one file with it."""
     with needs("model"):
         from straightpcf.model.filter import load_filter
         from straightpcf.service.backends.base import FileJob
         from straightpcf.service.backends.denoise_file import denoise_file
 
-    denoiser = load_filter(weights, device=device.value, threads=threads)
+    denoiser = load_filter(weights, device=device, threads=threads)
 
     def run(source: Path, target: Path, name: str | None, format: str | None, wanted: Any) -> Any:
         with replaced_when_complete(target) as unfinished, progress_bar(f"denoising {name or 'stdin'}") as show:
@@ -372,7 +376,7 @@ def _in_process(device: Device, weights: Path | None, threads: int | None) -> Ca
 
 @contextmanager
 def _one_by_one(
-    url: str | None, api_key: str | None, device: Device, weights: Path | None, threads: int | None, wanted: Any
+    url: str | None, api_key: str | None, device: str, weights: Path | None, threads: int | None, wanted: Any
 ) -> Iterator[Callable[[Path, Path], Any]]:
     """Lend what denoises one file into another and returns the report."""
     if url is None:

@@ -12,7 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -30,6 +30,7 @@ __all__ = [
     "ended_in_a_line",
     "exit_code",
     "for_each",
+    "forgiving_stderr",
     "interruptible",
     "needs",
     "print_json",
@@ -131,6 +132,25 @@ def _forget_stdout() -> None:
     import os
 
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def forgiving_stderr() -> None:
+    """Let what stderr does not take be lost: a full disk or a terminal that is gone changes nothing of what is done."""
+    import io
+
+    class Forgiving(io.FileIO):
+        def write(self, data: Any, /) -> int:
+            written = None
+            with suppress(OSError):
+                written = super().write(data)  # None: it does not block, and is full
+            return len(memoryview(data).cast("B")) if written is None else written
+
+    if sys.stderr is None:
+        return
+    sys.stderr.flush()
+    raw = Forgiving(sys.stderr.fileno(), "w", closefd=False)
+    encoding = sys.stderr.encoding
+    sys.stderr = io.TextIOWrapper(io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=True)
 
 
 @contextmanager

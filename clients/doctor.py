@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import warnings
+from pathlib import Path
 from typing import Any
 
 import straightpcf
@@ -50,8 +52,21 @@ def _examine_model() -> dict[str, Any]:
         "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
         "cuda": ", ".join(names) or "none",
         "device": denoiser.device,
+        "kernels": _kernels(),
         "weights": "shipped, loaded",
     }
+
+
+def _kernels() -> str:
+    """Say which compiled loops the CPU has, or why it has none and takes several times as long; compiles them."""
+    from straightpcf.model.kernels import cpu
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        library = cpu.load()
+    if told or library is None:
+        return str(told[0].message) if told else "none, as STRAIGHTPCF_NO_KERNELS asks; several times slower"
+    return Path(library._name).name.split("-")[2]
 
 
 def _extra(packages: tuple[str, ...]) -> str:

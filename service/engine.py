@@ -184,24 +184,24 @@ class Engine:
         """
         size = source.stat().st_size
         self.limits.check_bytes(size)
-        if request.format is not None:
-            format_named(request.format)  # raises before anything waits
+        # Raises before anything waits. "PLY" is "ply": what is kept is one spelling, by which a repeat is known, too.
+        format = None if request.format is None else format_named(request.format).name
         _check_id(request.id)
         content, weight = await asyncio.to_thread(
             lambda: (digest_of(source), estimate_points(source, name=request.name or "the cloud"))
         )
-        said = [request.endpoint, asdict(request.options), request.name, request.format, content]
+        said = [request.endpoint, asdict(request.options), request.name, format, content]
         new = NewJob(
             id=request.id or uuid.uuid4().hex,
             owner=request.owner,
             folder=uuid.uuid4().hex,
             name=request.name,
-            format=request.format,
+            format=format,
             options=request.options,
             bytes=size,
             weight=weight,
             spool=self.limits.spool_bytes(
-                size, weight=weight, iterations=request.options.iterations, converted=request.format is not None
+                size, weight=weight, iterations=request.options.iterations, converted=format is not None
             ),
             digest=hashlib.sha256(json.dumps(said).encode()).hexdigest(),
             idempotency_key=request.idempotency_key,

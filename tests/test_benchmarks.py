@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def run(name: str, *arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            importlib.import_module(f"benchmarks.{name}").main()
+            import_module(f"benchmarks.{name}").main()
         said, code = capsys.readouterr(), ended.value.code
         if isinstance(code, str):  # which Python prints, and exits with 1
             return 1, said.err + code
@@ -113,6 +113,14 @@ def test_passes(tmp_path: Path) -> None:
     assert (noise, number) == (0.02, 1)
     assert chamfer > across > sunk
     assert 0 < across < 4  # the noise's own is 4
+
+
+@pytest.mark.parametrize("name", ["quality", "speed", "kernels"])
+def test_a_device_is_named_as_the_filter_takes_it(refused: Refused, name: str) -> None:
+    for device, why in (("cuda:99", "cuda:99 was asked for, and torch sees"), ("tpu", "'tpu'; it must be")):
+        code, said = refused(name, "--device", device)
+        assert code == 2
+        assert why in said.splitlines()[-1]
 
 
 def test_kernels_that_cannot_be_compiled_are_not_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def install(folder: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHON": "python3.12"}
+def install(folder: Path, **settings: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHON": "python3.12", **settings}
     return subprocess.run(
         ["bash", "install.sh"], cwd=folder, env=environment, capture_output=True, text=True, timeout=60, check=False
     )
@@ -64,3 +64,18 @@ def test_another_pythons_own_package_is_installed(folder: Path) -> None:
     (folder / "bin" / "python3.12.bare").touch()
     assert install(folder).returncode == 0
     assert (folder / "asked").read_text().split()[-1] == "python3.12-venv"
+
+
+def test_a_torch_that_there_is_not_is_refused_before_anything_is_done(folder: Path) -> None:
+    ended = install(folder, STRAIGHTPCF_TORCH="CPU")
+    assert (ended.returncode, ended.stderr) == (1, "STRAIGHTPCF_TORCH is CPU; it must be cpu or cuda\n")
+    assert not (folder / ".venv").exists()
+
+
+def test_a_torch_without_cuda_that_was_there_before_is_named_where_cuda_is_wanted(folder: Path) -> None:
+    assert install(folder, STRAIGHTPCF_TORCH="cuda").stderr == ""
+    python = folder / ".venv" / "bin" / "python"
+    python.write_text('#!/bin/bash\n[[ "$*" != *torch.version.cuda* ]]\n')  # None there
+    ended = install(folder, STRAIGHTPCF_TORCH="cuda")
+    assert (ended.returncode, "no CUDA, and stays" in ended.stderr) == (0, True)
+    assert install(folder, STRAIGHTPCF_TORCH="cpu").stderr == ""

@@ -28,7 +28,8 @@ __all__ = ["AsyncClient", "AsyncJob", "AsyncJobs"]
 class AsyncClient:
     """Call a server from a coroutine; see `Client`. Cancelling a coroutine cancels its work on the server.
 
-    A client belongs to the event loop of its first call.
+    A client belongs to the event loop of its first call: in another one, as of a second `asyncio.run`, its calls raise
+    InvalidRequest.
     """
 
     def __init__(

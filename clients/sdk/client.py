@@ -31,7 +31,9 @@ class Client:
     url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
     api_key: sent as a bearer token. HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR are
     heeded over HTTP.
-    timeout: seconds of silence that are borne, None for any; of streams (events, patches, progress) at least 60.
+    timeout: seconds of silence that are borne in each attempt, None for any, over gRPC as over HTTP: a server that
+    hangs is given up after (1 + max_retries) times as long and the waits between, five minutes by default. Of streams
+    (events, patches, progress) at least 60, after which one whose job waits is asked for again, however often.
     max_retries: of a busy server and of a broken connection; every other error is raised at once. A server that has
     answered and is gone (it is restarted, and a proxy before it answers 502, 503 or 504) is asked on for `timeout`
     seconds, but by what uploads a file; 0: never.

@@ -18,6 +18,7 @@ from grpc_status import rpc_status
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure
+from straightpcf.clients.sdk.silence import Silence
 from straightpcf.points.errors import ERRORS_BY_CODE, ConnectionFailed, InternalError, StraightPCFError, TooManyBytes
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire.messages import event_of, frame_of, message_of, plain_of
@@ -26,6 +27,7 @@ from straightpcf.points.wire.patches import encode_end, encode_frame, encode_hea
 __all__ = ["UPLOAD", "Answer", "Upload", "failed_rpc", "metadata_of", "request_of"]
 
 UPLOAD = "CreateJob"
+_PART_BYTES = 2**16  # of a file in one message: it is taken whole or not at all, and a line may be slow
 
 _REQUESTS: Mapping[str, type[Message]] = {
     "GetJob": pb.GetJobRequest,
@@ -51,20 +53,28 @@ def request_of(call: Call, receiver: Receiver) -> Message:
 
 
 class Upload(Iterator[pb.CreateJobRequest]):
-    """A job's config and its file in chunks; error: what kept the rest from being read, of which gRPC says nothing."""
+    """A job's config and its file in chunks; error: what kept the rest from being read, of which gRPC says nothing.
 
-    def __init__(self, call: Call) -> None:
-        chunks = (pb.CreateJobRequest(chunk=chunk) for chunk in call.chunks())
+    silence: is told when the other side took a message, and when it has the next one.
+    """
+
+    def __init__(self, call: Call, silence: Silence) -> None:
+        self._silence = silence
+        parts = (chunk[at : at + _PART_BYTES] for chunk in call.chunks() for at in range(0, len(chunk), _PART_BYTES))
+        chunks = (pb.CreateJobRequest(chunk=part) for part in parts)
         self._messages = chain([pb.CreateJobRequest(config=message_of(pb.JobConfig, call.fields))], chunks)
         self.error: Exception | None = None
 
     def __next__(self) -> pb.CreateJobRequest:
         """Make one message."""
+        self._silence.ours()
         try:
             return next(self._messages)
         except (StraightPCFError, OSError) as error:
             self.error = error
             raise
+        finally:
+            self._silence.theirs()
 
 
 def metadata_of(call: Call, api_key: str | None) -> tuple[tuple[str, str], ...]:

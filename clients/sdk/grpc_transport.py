@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Generator, Iterator
+from contextlib import aclosing, closing
 from typing import Any
 from urllib.parse import urlsplit
 
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
+from straightpcf.clients.sdk.retry import Failure
+from straightpcf.clients.sdk.silence import Silence
 from straightpcf.clients.sdk.transport import AsyncTransport, Attempts, Transport
-from straightpcf.points.errors import MissingDependency
+from straightpcf.points.errors import ConnectionFailed, MissingDependency
 
 try:
     import grpc
@@ -30,7 +33,8 @@ except ImportError as exc:
 
 __all__ = ["AsyncGrpcTransport", "GrpcTransport"]
 
-# A dead peer is noticed by pings, so that a stream may be silent for as long as it likes.
+_SHORT = frozenset(("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth"))
+# A dead peer is noticed by pings before the silence is too long.
 _OPTIONS = (("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000))
 
 
@@ -54,19 +58,37 @@ class GrpcTransport(Transport):
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one call."""
-        upload = Upload(call) if call.rpc == UPLOAD else None
+        silence = _silence_in(call, self.timeout)
+        upload = Upload(call, silence) if call.rpc == UPLOAD else None
         try:
             answer = Answer(call, receiver)
-            send = upload or request_of(call, receiver)
-            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
-            for message in came if hasattr(came, "__next__") else (came,):
-                answer.take(message)
-                yield
+            with closing(self._messages(call, upload or request_of(call, receiver), silence, attempts)) as messages:
+                for message in messages:
+                    answer.take(message)
+                    yield
             attempts.failure = answer.finish()
-        except grpc.RpcError as error:
+        except (grpc.RpcError, grpc.FutureCancelledError) as error:
             if upload is not None and upload.error is not None:
                 raise upload.error from None
-            attempts.failure = failed_rpc(error, self._url)
+            attempts.failure = _failed(error, silence, self._url)
+
+    def _messages(self, call: Call, send: Any, silence: Silence, attempts: Attempts) -> Generator[Any]:
+        ask, how = getattr(self._stub, call.rpc), _how(call, self._key, self.timeout)
+        if call.rpc in _SHORT:
+            yield ask(send, **how)
+        elif call.rpc == UPLOAD:
+            coming = ask.future(send, **how)
+            with silence.watched(coming):
+                yield coming.result()
+        else:
+            coming = ask(send, **how)
+            with silence.watched(coming):
+                if coming.initial_metadata():  # which a server that hangs does not send
+                    attempts.answered()
+                for message in coming:
+                    silence.ours()
+                    yield message
+                    silence.theirs()
 
 
 class AsyncGrpcTransport(AsyncTransport):
@@ -87,27 +109,39 @@ class AsyncGrpcTransport(AsyncTransport):
     async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncGenerator[None]:
         """Make one call."""
         self._open()
-        upload = Upload(call) if call.rpc == UPLOAD else None
+        silence = _silence_in(call, self.timeout)
+        upload = Upload(call, silence) if call.rpc == UPLOAD else None
         try:
             answer = Answer(call, receiver)
             send = request_of(call, receiver) if upload is None else _asynchronous(upload)
-            came = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
-            if hasattr(came, "__aiter__"):
-                async for message in came:
+            async with aclosing(self._messages(call, send, silence, attempts)) as messages:
+                async for message in messages:
                     answer.take(message)
                     yield
-            else:
-                answer.take(await came)
-                yield
             attempts.failure = answer.finish()
         except (grpc.RpcError, asyncio.CancelledError) as error:
             if upload is not None and upload.error is not None:
                 raise upload.error from None
             if not isinstance(error, grpc.RpcError):
-                if (task := asyncio.current_task()) is not None and not task.cancelling():
-                    self.check_open()  # closing it cancels its calls, but not who waits for them
-                raise
-            attempts.failure = failed_rpc(error, self._url)
+                if (task := asyncio.current_task()) is not None and task.cancelling():
+                    raise
+                self.check_open()  # closing it cancels its calls, but not who waits for them
+                if not silence.was_too_long:
+                    raise
+            attempts.failure = _failed(error, silence, self._url)
+
+    async def _messages(self, call: Call, send: Any, silence: Silence, attempts: Attempts) -> AsyncGenerator[Any]:
+        coming = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
+        async with silence.watched_here(coming):
+            if hasattr(coming, "__aiter__"):
+                if await coming.initial_metadata():
+                    attempts.answered()
+                async for message in coming:
+                    silence.ours()
+                    yield message
+                    silence.theirs()
+            else:
+                yield await coming
 
     def _open(self) -> None:
         if self._channel is None:
@@ -132,8 +166,20 @@ def _target(url: str) -> tuple[str, Any]:
 
 def _how(call: Call, api_key: str | None, timeout: float | None) -> dict[str, Any]:
     """Return the metadata and the deadline: of a call with one short answer, and of one that is given up by then."""
-    short = call.rpc in ("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth")
-    return {"metadata": metadata_of(call, api_key), "timeout": call.patience(timeout if short else None)}
+    usual = timeout if call.rpc in _SHORT else None
+    return {"metadata": metadata_of(call, api_key), "timeout": call.patience(usual)}
+
+
+def _silence_in(call: Call, timeout: float | None) -> Silence:
+    return Silence(None if call.rpc in _SHORT else call.patience(timeout))
+
+
+def _failed(error: BaseException, silence: Silence, url: str) -> Failure:
+    """Tell what ended a call."""
+    if isinstance(error, grpc.RpcError) and not silence.was_too_long:
+        return failed_rpc(error, url)
+    said = f"{url}: nothing came or was taken for {silence.seconds:g} s"
+    return Failure(error=ConnectionFailed(said), retryable=True, cause=error if isinstance(error, Exception) else None)
 
 
 async def _asynchronous(messages: Iterator[Any]) -> AsyncIterator[Any]:

@@ -41,6 +41,7 @@ class HttpTransport(Transport):
         try:
             with self._http.stream(**asked, content=None if call.body is None else call.chunks()) as response:
                 if response.is_success:
+                    attempts.answered()
                     receiver.begin(response.status_code, response.headers)
                     has_events = call.events and response.status_code != 204
                     for item in httpx2.EventSource(response) if has_events else response.iter_bytes():
@@ -73,6 +74,7 @@ class AsyncHttpTransport(AsyncTransport):
             body = None if call.body is None else call.async_chunks()
             async with self._http.stream(**asked, content=body) as response:
                 if response.is_success:
+                    attempts.answered()
                     receiver.begin(response.status_code, response.headers)
                     has_events = call.events and response.status_code != 204
                     async for item in httpx2.EventSource(response) if has_events else response.aiter_bytes():

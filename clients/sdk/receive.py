@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from straightpcf.clients.sdk.events import Completed, Event, parse_event
 from straightpcf.clients.sdk.retry import Failure
-from straightpcf.points.errors import ConnectionFailed, InvalidRequest
+from straightpcf.points.errors import ConnectionFailed, InvalidRequest, MalformedFile
 from straightpcf.points.wire.patches import PatchFrame, PatchReader
 
 __all__ = ["Body", "Events", "Patches", "Receiver"]
@@ -133,8 +133,12 @@ class Patches:
         self._reader, self._skip = PatchReader(), self.furthest
 
     def write(self, item: bytes) -> None:
-        """Take bytes."""
-        for frame in self._reader.feed(item):
+        """Take bytes; raises ConnectionFailed for what is no server's of ours."""
+        try:
+            frames = self._reader.feed(item)
+        except MalformedFile as exc:
+            raise ConnectionFailed(f"these are no patches of a StraightPCF server: {exc.message}") from exc
+        for frame in frames:
             self._ended = self._ended or frame.end
             if self._skip > 0:
                 self._skip -= 1

@@ -62,7 +62,8 @@ class Call:
     rpc, fields: the same as a call of the gRPC service, in the JSON form of its message.
     request_id: names the request in the server's log, the same for every attempt.
     timeout: seconds of silence to bear, None for the client's own. silence: those to bear at least.
-    events: the answer is a stream of events. once: do not try again. until: give up then, on the monotonic clock.
+    events: the answer is a stream of events. may_wait: one that is held open with nothing to say is none that failed.
+    once: do not try again. until: give up then, on the monotonic clock.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -75,6 +76,7 @@ class Call:
     timeout: float | None = None
     silence: float = 0.0
     events: bool = False
+    may_wait: bool = False
     once: bool = False
     until: float = math.inf
     request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -205,8 +207,9 @@ def events_call(id: str) -> Call:
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
     path = _job(id, "events")
     return Call(
-        method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True, silence=STREAM_SECONDS
-    )
+        method="GET", path=path, rpc="WatchJob", fields={"id": id}, headers=headers, events=True,
+        silence=STREAM_SECONDS, may_wait=True,
+    )  # fmt: skip
 
 
 def patches_call(id: str) -> Call:
@@ -214,8 +217,9 @@ def patches_call(id: str) -> Call:
     headers = {"Accept": PATCHES_MEDIA_TYPE}
     path = _job(id, "stream")
     return Call(
-        method="GET", path=path, rpc="StreamPatches", fields={"id": id}, headers=headers, silence=STREAM_SECONDS
-    )
+        method="GET", path=path, rpc="StreamPatches", fields={"id": id}, headers=headers, silence=STREAM_SECONDS,
+        may_wait=True,
+    )  # fmt: skip
 
 
 def result_call(id: str) -> Call:

@@ -16,12 +16,13 @@ from straightpcf.clients.sdk.arguments import check_count, check_silence, check_
 from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
-from straightpcf.clients.sdk.retry import Failure, next_delay
+from straightpcf.clients.sdk.retry import FIRST_DELAY_SECONDS, Failure, next_delay
 from straightpcf.points.errors import ConnectionFailed, InvalidOptions, InvalidRequest
 
 __all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async", "without_password"]
 
 _SCHEMES = ("http", "https", "grpc", "grpcs")
+_HELD_SECONDS = 10.0  # after an answer began: what breaks off sooner is broken
 _T = TypeVar("_T")
 
 
@@ -111,11 +112,21 @@ class Attempts:
         self._patience = patience if call.body is None else 0.0
         self._attempt, self._furthest = 0, receiver.furthest
         self._since, self._until = math.nan, call.until
+        self._held_seconds = min(_HELD_SECONDS, call.silence / 2) if call.may_wait else None
+        self._answered: float | None = None
         self.failure: Failure | None = None
+
+    def answered(self) -> None:
+        """Note that an attempt is being answered."""
+        if self._held_seconds is not None:
+            self._answered = time.monotonic()
 
     def delay(self) -> float:
         """Return the seconds to wait before the next attempt, or raise what the last one met."""
         assert self.failure is not None
+        if self._was_held() and self.failure.retryable:
+            self._attempt = 0
+            return FIRST_DELAY_SECONDS
         if self._receiver.furthest > self._furthest:
             self._attempt, self._furthest = 0, self._receiver.furthest
         if self._attempt == 0:
@@ -129,6 +140,11 @@ class Attempts:
             raise self.failure.error from self.failure.cause
         self._attempt += 1
         return delay
+
+    def _was_held(self) -> bool:
+        """Tell whether the server held the last answer open, as for a job that waits: a proxy or we gave that up."""
+        began, self._answered = self._answered, None
+        return began is not None and time.monotonic() - began >= (self._held_seconds or 0.0)
 
 
 class _Patience:
@@ -190,6 +206,16 @@ class Transport(_Patience, ABC):
 
 class AsyncTransport(_Patience, ABC):
     """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
+
+    _loop: asyncio.AbstractEventLoop | None = None
+
+    def check_open(self) -> None:
+        """Raise InvalidRequest also in another event loop than that of the first call, where connections belong."""
+        super().check_open()
+        loop = asyncio.get_running_loop()
+        self._loop = self._loop or loop
+        if loop is not self._loop:
+            raise InvalidRequest("this client belongs to another event loop, that of its first call: make one in each")
 
     @abstractmethod
     async def close(self) -> None:

@@ -22,6 +22,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, distance_loss, velocity_loss
 from straightpcf.model.train.passed import training_patches
+from straightpcf.model.train.run_lock import held
 from straightpcf.model.train.soap import SOAP
 from straightpcf.model.train.state import Average, load_state, read_network, save_state, take_distance_module
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
@@ -90,7 +91,7 @@ def train(
     wants it.
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed, thread
     and process count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
-    missing or unfit, DeviceUnavailable, and what `PatchSource.read` does.
+    missing or unfit or another process trains in run_dir, DeviceUnavailable, and what `PatchSource.read` does.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
@@ -108,69 +109,70 @@ def train(
     if place.type == "cuda" and place.index is not None:  # "cuda" is the current one, and set_device takes no other
         torch.cuda.set_device(place)  # captures and Triton work on the current one
 
-    if resuming := state_path.exists():
-        _check_run(state_path, stage, couplings)
-    network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
-    if distance is not None and not resuming:
-        take_distance_module(network, distance)
-    trained = _trained_part(stage, network)
-    optimiser = SOAP(trained.parameters())
-    average = Average(network, _EMA_DECAY)
-    start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
+    with held(run_dir):
+        if resuming := state_path.exists():
+            _check_run(state_path, stage, couplings)
+        network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
+        if distance is not None and not resuming:
+            take_distance_module(network, distance)
+        trained = _trained_part(stage, network)
+        optimiser = SOAP(trained.parameters())
+        average = Average(network, _EMA_DECAY)
+        start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
-    source = training_patches(archives, passed, network.distance_module)
-    stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
-    if stage == "cvm":
-        stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
-    loss_of = partial(stage_loss, network)
-    held_out = PatchSource.read(*archives, validation=True)
-    fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
-    _cut_log(run_dir / _LOG_FILE, start)
-    share = batch_size // processes
-    team = None
-    if processes > 1:
-        team = Team(processes - 1, network, trained, stage_loss, archives, share, seed, start=start, passed=passed)
-    step: Step = (
-        GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
-        if place.type == "cuda"
-        else HostStep(source, loss_of, trained, optimiser, rng, share, team)
-    )
-    began = time.monotonic()
-    validation: float | None = None
-    with (run_dir / _LOG_FILE).open("a", newline="") as file, team or nullcontext():
-        log = csv.writer(file)
-        recent: list[float] = []
-        recent_loss = math.nan
-        trained.train(not settled)
-        for iteration in range(start + 1, iterations + 1):
-            rate = _learning_rate(learning_rate, iteration, iterations)
-            loss = step(rate)
-            average.update(iteration)
-            if iteration % _TURN_EVERY == 0:
-                optimiser.turn_bases()
-            last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
-            stopping = stop()
-            # On CUDA reading the loss waits for the device: only where it is reported.
-            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
-                recent.append(loss.item())
-                if not math.isfinite(recent[-1]):
-                    raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
-                recent_loss = recent[-1]
-            if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
-                validation = _validate(stage_loss, network, average, fixed.to(place))
-            if iteration % _LOG_EVERY == 0 or last or stopping:
-                progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
-                            "learning_rate": learning_rate, "validation": validation}  # fmt: skip
-                save_state(state_path, network, average, optimiser, rng, progress)
-                seconds = round(time.monotonic() - began, 1)
-                log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
-                file.flush()
-                recent.clear()
-            if on_step is not None:
-                on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
-            validation = None
-            if last or stopping:
-                break
+        source = training_patches(archives, passed, network.distance_module)
+        stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
+        if stage == "cvm":
+            stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
+        loss_of = partial(stage_loss, network)
+        held_out = PatchSource.read(*archives, validation=True)
+        fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
+        _cut_log(run_dir / _LOG_FILE, start)
+        share = batch_size // processes
+        team = None
+        if processes > 1:
+            team = Team(processes - 1, network, trained, stage_loss, archives, share, seed, start=start, passed=passed)
+        step: Step = (
+            GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
+            if place.type == "cuda"
+            else HostStep(source, loss_of, trained, optimiser, rng, share, team)
+        )
+        began = time.monotonic()
+        validation: float | None = None
+        with (run_dir / _LOG_FILE).open("a", newline="") as file, team or nullcontext():
+            log = csv.writer(file)
+            recent: list[float] = []
+            recent_loss = math.nan
+            trained.train(not settled)
+            for iteration in range(start + 1, iterations + 1):
+                rate = _learning_rate(learning_rate, iteration, iterations)
+                loss = step(rate)
+                average.update(iteration)
+                if iteration % _TURN_EVERY == 0:
+                    optimiser.turn_bases()
+                last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
+                stopping = stop()
+                # On CUDA reading the loss waits for the device: only where it is reported.
+                if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
+                    recent.append(loss.item())
+                    if not math.isfinite(recent[-1]):
+                        raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
+                    recent_loss = recent[-1]
+                if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
+                    validation = _validate(stage_loss, network, average, fixed.to(place))
+                if iteration % _LOG_EVERY == 0 or last or stopping:
+                    progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
+                                "learning_rate": learning_rate, "validation": validation}  # fmt: skip
+                    save_state(state_path, network, average, optimiser, rng, progress)
+                    seconds = round(time.monotonic() - began, 1)
+                    log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
+                    file.flush()
+                    recent.clear()
+                if on_step is not None:
+                    on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
+                validation = None
+                if last or stopping:
+                    break
     return state_path
 
 

@@ -18,6 +18,7 @@ import straightpcf
 from straightpcf.clients.cli import app
 from straightpcf.clients.console import EXIT_CODES, exit_code
 from straightpcf.clients.doctor import EXTRAS
+from straightpcf.model.kernels import cpu
 from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
@@ -65,6 +66,8 @@ def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: 
     [
         (["denoise", "IN", "OUT.npy", "--iterations", "0"], 2, "error [invalid_options]"),
         (["denoise", "IN", "OUT.npy", "--device", "tpu"], 2, "tpu"),
+        (["denoise", "IN", "OUT.npy", "--device", "cuda:99"], 4, "cuda:99"),
+        (["watch", ".", "--once", "--device", "cuda:99"], 4, "cuda:99"),
         (["denoise", "IN"], 2, "OUT"),
         (["denoise", "IN", "OUT.gif"], 3, "error [unknown_format]"),
         (["denoise", "missing.npy", "OUT.npy"], 3, "missing.npy"),
@@ -173,6 +176,19 @@ def test_doctor_tells_what_is_here() -> None:
     assert done.exit_code == (4 if "problem" in findings else 0)
 
 
+def test_doctor_says_why_there_are_no_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if cpu._SHIPPED.is_dir():
+        pytest.skip("the kernels are shipped here")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))  # no compiler
+    cpu.load.cache_clear()
+    try:
+        done = CliRunner().invoke(app, ["doctor", "--json"])
+    finally:
+        cpu.load.cache_clear()
+    assert "no C++ compiler: install g++" in json.loads(done.stdout)["kernels"]
+
+
 def test_doctor_looks_for_what_pyproject_asks_for() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
@@ -233,6 +249,7 @@ if __name__ == "__main__":
         ({"a": torus(1500)}, [], 3, "malformed_file"),
         ({"a/1": torus(500)}, [], 3, "too_few_points"),
         ({"a/1": torus(1500)}, ["--device", "cuda:99"], 4, "device_unavailable"),
+        ({"a/1": torus(1500)}, ["--seed", "9223372036854775808"], 2, "--seed"),
     ],
 )
 def test_training_refuses_what_it_cannot_use_by_code(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -127,6 +128,16 @@ def test_a_full_stdout_is_named_and_ends_what_it_cannot_tell_of(server: RunningS
             done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, check=False)
         assert (done.returncode, done.stderr) == (3, said), arguments
     assert len(cli(server, "jobs").stdout.splitlines()) == before + 1  # of three that were to be submitted
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+def test_what_stderr_does_not_take_changes_no_exit_code(scan: Path) -> None:
+    done = ("denoise", scan, scan.with_name("out.npy"), "--iterations", 1, "--device", "cpu")
+    for arguments, code in ((done, 0), (("info", "missing.npy"), 3), (("frobnicate",), 2)):
+        command = shlex.join([sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)])
+        for line in (f"{command} 2>/dev/full", f"exec 3> >(exec <&-); sleep 0.2; {command} 2>&3"):  # a reader that ends
+            ended = subprocess.run(["bash", "-c", line], env=clean_environment(), timeout=60, check=False)
+            assert ended.returncode == code, line
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])

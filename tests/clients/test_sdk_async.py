@@ -13,7 +13,7 @@ import httpx2
 import pytest
 
 from straightpcf.clients.sdk import AsyncClient, AsyncJob, http_transport, request, retry
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.errors import ConnectionFailed, InvalidRequest
 
 HEALTHY = b'HTTP/1.1 200 OK\r\nContent-Length: 29\r\nConnection: close\r\n\r\n{"status":"ok","ready":true}\n'
 STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n: here\n\n"
@@ -33,6 +33,17 @@ def test_calls_that_a_close_cuts_off_say_that_it_is_closed(monkeypatch: pytest.M
     with socket.create_server(("127.0.0.1", 0)) as silent:
         for scheme in ("http", "grpc"):
             asyncio.run(close_meanwhile(f"{scheme}://127.0.0.1:{silent.getsockname()[1]}"))
+
+
+def test_a_client_in_another_event_loop_says_so() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        for scheme in ("http", "grpc"):
+            url = f"{scheme}://127.0.0.1:{silent.getsockname()[1]}"
+            client = AsyncClient(url, timeout=0.2, max_retries=0)
+            with pytest.raises(ConnectionFailed):
+                asyncio.run(client.health())
+            with pytest.raises(InvalidRequest, match="belongs to another event loop"):
+                asyncio.run(client.health())
 
 
 def test_an_upload_that_is_cancelled_while_its_file_is_read_is_cancelled(

@@ -16,7 +16,7 @@ import pytest
 
 from straightpcf.clients.sdk import AsyncClient, Client, retry, transport
 from straightpcf.clients.sdk.receive import Body
-from straightpcf.clients.sdk.request import Call
+from straightpcf.clients.sdk.request import Call, patches_call
 from straightpcf.clients.sdk.transport import Attempts
 from straightpcf.points.errors import (
     ConnectionFailed,
@@ -116,6 +116,29 @@ def test_it_is_asked_for_no_longer_than_silence_is_borne_and_uploads_are_counted
             assert attempts.delay() > 0
         with pytest.raises(ConnectionFailed):
             attempts.delay()
+
+
+def test_an_answer_that_was_held_open_is_no_attempt_that_failed_unless_it_ends_in_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(transport, "time", SimpleNamespace(monotonic=lambda: now))
+    attempts = Attempts(patches_call("a"), Body(), max_retries=1)
+    for held in (60.0, 11.0, 60.0):
+        attempts.failure = retry.Failure(error=ConnectionFailed("silent"), retryable=True)
+        attempts.answered()
+        now += held
+        assert attempts.delay() == retry.FIRST_DELAY_SECONDS
+    attempts.answered()  # it breaks off at once, again and again
+    assert attempts.delay() > 0
+    attempts.answered()
+    with pytest.raises(ConnectionFailed):
+        attempts.delay()
+    attempts.answered()
+    now += 60.0
+    attempts.failure = retry.Failure(error=InvalidRequest("canceled"), retryable=False)
+    with pytest.raises(InvalidRequest):
+        attempts.delay()
 
 
 def test_retries_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,6 +275,17 @@ def test_an_event_of_another_server_is_told_as_such(said: str, server: RunningSe
         proxied = client.jobs.get(job.id)
         with pytest.raises(ConnectionFailed, match="no event of a StraightPCF server: 'queued'"):
             list(proxied.events())
+
+
+def test_patches_of_another_server_are_told_as_such(server: RunningServer) -> None:
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(400), 0.01), iterations=1)
+        told = canned("200 OK", json.dumps(job.info.json))
+    login = canned("200 OK", "<html>please log in</html>", "Content-Type: text/html")
+    with answering(told, login) as (url, _), Client(url, max_retries=0) as client:
+        proxied = client.jobs.get(job.id)
+        with pytest.raises(ConnectionFailed, match="no patches of a StraightPCF server"):
+            list(proxied.patches())
 
 
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:

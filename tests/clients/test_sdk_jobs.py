@@ -167,6 +167,26 @@ def test_a_short_timeout_is_no_limit_to_a_job_that_waits_its_turn(url: str, monk
         assert [other.result(timeout=60) for other in others] == [400, 400, 400, 400]
 
 
+def test_events_and_patches_of_a_job_that_waits_long_are_waited_for(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    monkeypatch.setattr("straightpcf.clients.sdk.request.STREAM_SECONDS", 0.3)
+
+    async def there(id: str) -> int:
+        async with AsyncClient(url, timeout=0.3, max_retries=1) as client:
+            return sum([len(frame.indices) async for frame in (await client.jobs.get(id)).patches()])
+
+    with Client(url) as patient, Client(url, timeout=0.3, max_retries=1) as hasty:
+        first = patient.jobs.create(LARGE, iterations=3)
+        job = hasty.jobs.create(SMALL, iterations=1)
+        with ThreadPoolExecutor() as pool:
+            also = pool.submit(asyncio.run, there(job.id))
+            told = pool.submit(lambda: list(job.events()))
+            pool.submit(lambda: (time.sleep(2.5), first.cancel()))
+            assert sum(len(frame.indices) for frame in job.patches()) == also.result() == 400
+            assert [event.id for event in told.result()] == list(range(1, 1 + len(told.result())))
+        first.delete()
+
+
 @pytest.mark.parametrize(("suffix", "first"), [("csv", b","), ("pts", b"400\n")])
 def test_text_of_every_kind_comes_from_a_server_as_its_suffix_says(
     client: Client, tmp_path: Path, suffix: str, first: bytes

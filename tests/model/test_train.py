@@ -166,6 +166,23 @@ def test_a_shared_run_is_the_same_again_and_where_it_was_interrupted(data: Path,
     assert same(once, run("again"))
 
 
+def test_a_directory_in_which_a_run_is_at_work_is_no_other_ones(data: Path, tmp_path: Path) -> None:
+    wanted = partial(train, "vm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1)
+    refused: list[str] = []
+
+    def another_one(_: TrainStep) -> None:
+        state = (tmp_path / "state.safetensors").read_bytes()
+        with pytest.raises(InvalidOptions) as error:
+            wanted(iterations=5)
+        refused.append(str(error.value))
+        assert (tmp_path / "state.safetensors").read_bytes() == state
+
+    wanted(on_step=another_one)
+    assert refused == [f"another training run is at work in {tmp_path}: give one of its own"]
+    wanted(iterations=2)  # what the first one left does not keep the next from going on
+    assert read_network(tmp_path / "state.safetensors")[1]["iteration"] == 2
+
+
 def test_a_run_of_another_stage_or_stack_is_not_gone_on_with(data: Path, tmp_path: Path, velocity_run: Path) -> None:
     run = partial(train, data=data, run_dir=tmp_path, iterations=1, batch_size=1, threads=1, init=velocity_run)
     run("cvm")

@@ -82,6 +82,13 @@ def test_grpc_answers_a_repeat_too(full_server: RunningServer, http: httpx2.Clie
         assert create(key="k").id == create(key="k").id
 
 
+def test_a_format_is_one_in_any_letters(http: httpx2.Client) -> None:
+    first = http.put("/jobs/one?filename=a.xyz&format=PLY&iterations=AUTO", content=BODY)
+    again = http.put("/jobs/one?filename=a.xyz&format=ply&iterations=auto", content=BODY)
+    assert (first.status_code, again.status_code) == (202, 200)
+    assert first.json()["format"] == "ply"
+
+
 def test_a_key_finds_its_job_whatever_the_id(http: httpx2.Client) -> None:
     # The SDK chooses an id for every call, so that it can cancel what it never heard of.
     key = {"Idempotency-Key": "k"}
