@@ -31,7 +31,17 @@ _MAX_WHOLE = 2**63 - 1  # what SQLite and gRPC hold
 
 
 def _default_data_dir() -> Path:
-    return Path.home() / ".local" / "share" / "straightpcf"
+    return _at_home("data_dir", Path("~/.local/share/straightpcf"))
+
+
+def _at_home(setting: str, path: Path) -> Path:
+    """Read ~ as a shell does, which does not in a service's file, nor behind an equals sign."""
+    try:
+        return path.expanduser()
+    except RuntimeError as exc:  # a container's user that nobody has listed
+        raise InvalidOptions(
+            f"{setting} is {path}, and that home is not known (HOME is not set?): give a path"
+        ) from exc
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +95,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse limits that would admit nothing."""
+        for name in ("data_dir", "api_keys_file", "weights"):
+            if (path := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _at_home(name, path))
         for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and value <= 0:

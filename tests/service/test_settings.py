@@ -68,6 +68,22 @@ def test_a_blank_variable_is_a_setting_left_out_but_a_blank_key_file_opens_no_se
         Settings.from_environment({"STRAIGHTPCF_API_KEYS_FILE": ""}).keys()
 
 
+def test_a_tilde_is_ones_home_also_where_no_shell_reads_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    names = ("data_dir", "weights", "api_keys_file")
+    settings = Settings.from_environment({f"STRAIGHTPCF_{name.upper()}": f"~/{name}" for name in names})
+    assert [getattr(settings, name) for name in names] == [tmp_path / name for name in names]
+    assert Settings(data_dir=Path("~")).data_dir == tmp_path
+
+
+def test_a_user_without_a_home_is_asked_for_a_data_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)  # as of a container's --user 12345
+    with pytest.raises(InvalidOptions, match=r"data_dir is ~/.local/share/straightpcf, .*HOME is not set"):
+        Settings()
+    assert Settings(data_dir=tmp_path).data_dir == tmp_path
+
+
 def test_what_kubernetes_and_our_other_programs_are_told_is_no_setting() -> None:
     assert Settings.from_environment(KUBERNETES | OF_OTHERS) == Settings()
 
