@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from straightpcf.points.errors import InvalidOptions
+from straightpcf.service.app import create_app
 from straightpcf.service.settings import Settings
 from tests.conftest import clean_environment, run_server
+from tests.service.fakes import ObedientBackend
 
 # What a pod is told of the Services straightpcf and straightpcf-grpc in its namespace.
 KUBERNETES = {
@@ -140,6 +142,33 @@ def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_wei
     assert done.returncode == 2
     assert name.lower() in done.stderr
     assert "Started server process" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[
+            ("cors_origins", each)
+            for each in ("friend.example", "https://a.example/", "http://a.example:80", "https://")
+        ],
+        *[
+            ("allowed_hosts", each)
+            for each in ("a.example:8000", "https://a.example", "*", "münchen.example", "a.example.")
+        ],
+    ],
+)
+def test_a_host_or_an_origin_that_no_browser_ever_names_keeps_a_server_from_starting(
+    name: str, value: str, tmp_path: Path
+) -> None:
+    settings = Settings(data_dir=tmp_path, **{name: f"good.example,{value}" if name == "allowed_hosts" else value})
+    with pytest.raises(InvalidOptions, match=rf"{name}: .*{re.escape(value)}"):
+        create_app(settings, backend=ObedientBackend())
+
+
+def test_hosts_and_origins_are_read_in_small_letters() -> None:
+    settings = Settings(cors_origins="*, null, HTTPS://A.example:8443", allowed_hosts="A.example, [fd00::2], 10.0.0.1")
+    assert settings.origins() == ("*", "null", "https://a.example:8443")
+    assert settings.hosts() == ("a.example", "fd00::2", "10.0.0.1")
 
 
 def test_compose_lets_a_server_end_in_peace() -> None:
