@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Literal, TypeVar
@@ -13,6 +14,9 @@ __all__ = ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
 MAX_ITERATIONS = 10
 MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
 _ITERATIONS, _SEED, _STRENGTH = f'"auto" or 1..{MAX_ITERATIONS}', f"an integer in 0..{2**32 - 1}", "in 0..1"
+_NUMBER = re.compile(
+    r"\s*[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?\s*", re.ASCII | re.IGNORECASE
+)  # Python reads more: 1_000
 _T = TypeVar("_T", int, float)
 
 
@@ -82,6 +86,8 @@ def _iterations(text: str) -> int | Literal["auto"]:
 
 def _number(name: str, kind: type[_T], text: str, limit: str) -> _T:
     try:
+        if not _NUMBER.fullmatch(text):
+            raise ValueError(text)
         return kind(text)
     except ValueError:
         raise InvalidOptions(f"{name} is {text[:40]!r}; it must be {limit}") from None

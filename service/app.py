@@ -89,9 +89,8 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.state.coming = Coming()
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
-    origins = tuple(origin.strip() for origin in settings.cors_origins.split(",") if origin.strip())
+    origins, hosts = settings.origins(), settings.hosts()
     if gate.open and is_loopback(settings.host):
-        hosts = tuple(host.strip().lower() for host in settings.allowed_hosts.split(",") if host.strip())
         app.add_middleware(HostMiddleware, hosts=hosts, origins=origins)
     app.add_middleware(MetricsMiddleware, telemetry=telemetry)
     app.add_middleware(RequestIdMiddleware)

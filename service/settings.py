@@ -21,6 +21,8 @@ _OF_OTHERS = frozenset({f"{ENVIRONMENT_PREFIX}{name}" for name in ("URL", "KEY",
 _SERVICE_LINK = re.compile(r"\w*_(SERVICE_(HOST|PORT\w*)|PORT_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?)")
 _SERVICE_URL = re.compile(r"(tcp|udp|sctp)://.+:\d+")
 _ROOT_PATH = re.compile(r"(/[\w.~-]+)*", re.ASCII)
+_ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://([a-z0-9._-]+|\[[0-9a-f:.]+\])(:[0-9]+)?", re.ASCII)  # as browsers send it
+_HOST = re.compile(r"[a-z0-9._-]*[a-z0-9_-]|[0-9a-f:.]*:[0-9a-f:.]*", re.ASCII)  # without a dot at its end
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
@@ -31,7 +33,17 @@ _MAX_WHOLE = 2**63 - 1  # what SQLite and gRPC hold
 
 
 def _default_data_dir() -> Path:
-    return Path.home() / ".local" / "share" / "straightpcf"
+    return _at_home("data_dir", Path("~/.local/share/straightpcf"))
+
+
+def _at_home(setting: str, path: Path) -> Path:
+    """Read ~ as a shell does, which does not in a service's file, nor behind an equals sign."""
+    try:
+        return path.expanduser()
+    except RuntimeError as exc:  # a container's user that nobody has listed
+        raise InvalidOptions(
+            f"{setting} is {path}, and that home is not known (HOME is not set?): give a path"
+        ) from exc
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +97,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse limits that would admit nothing."""
+        for name in ("data_dir", "api_keys_file", "weights"):
+            if (path := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _at_home(name, path))
         for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and value <= 0:
@@ -107,6 +122,28 @@ class Settings:
             raise InvalidOptions(
                 f"root_path is {self.root_path[:80]!r}; it must be like /straightpcf, with no / at its end"
             )
+
+    def origins(self) -> tuple[str, ...]:
+        """Return cors_origins; raises InvalidOptions for one that no browser sends."""
+        found = _listed(self.cors_origins)
+        for origin in found:
+            usual = {"https": ":443", "http": ":80"}.get(origin.partition(":")[0])
+            is_sent = _ORIGIN.fullmatch(origin) and not (usual and origin.endswith(usual))
+            if not is_sent and origin not in ("*", "null"):
+                raise InvalidOptions(
+                    f"cors_origins: no browser sends {origin[:80]!r}; it must be like https://host or http://host:8080"
+                )
+        return found
+
+    def hosts(self) -> tuple[str, ...]:
+        """Return allowed_hosts; raises InvalidOptions for what is no name or address by itself."""
+        found = tuple(host.removeprefix("[").removesuffix("]") for host in _listed(self.allowed_hosts))
+        for host in found:
+            if not _HOST.fullmatch(host):
+                raise InvalidOptions(
+                    f"allowed_hosts: {host[:80]!r} is no name or address by itself, as host or 10.0.0.1: no port, no /"
+                )
+        return found
 
     def keys(self) -> tuple[str, ...]:
         """Return the API keys; raises InvalidOptions for a key that no header carries, and where none is left.
@@ -149,6 +186,10 @@ def _is_of_others(variable: str, text: str) -> bool:
     if variable in _OF_OTHERS or _SERVICE_LINK.fullmatch(variable):
         return True
     return variable.endswith("_PORT") and _SERVICE_URL.fullmatch(text) is not None
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    return tuple(item.strip().lower() for item in text.split(",") if item.strip())
 
 
 def _usable_keys(texts: Iterable[str], setting: str) -> list[str]:

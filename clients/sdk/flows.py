@@ -103,7 +103,9 @@ def wait(
     the timeout is over, where it began before; on the monotonic clock.
     """
     if on_progress is not None and timeout is None:
-        return (yield request.events_call(id), _Watched(on_progress))  # type: ignore[no-any-return]
+        told: JobInfo | None = yield request.events_call(id), _Watched(on_progress)
+        if told is not None:
+            return told  # else it was deleted and made anew meanwhile, and has had no more events than that one
     poll = POLL_SECONDS if silence is None else min(POLL_SECONDS, silence / 2)
     deadline = deadline or _after(timeout)
     while True:

@@ -91,7 +91,8 @@ def train(
     wants it.
     Writes `state.safetensors` and `log.csv` to run_dir and returns the state's path; on a CPU the same seed, thread
     and process count give the same weights, on CUDA sums have no fixed order. Raises InvalidOptions where `init` is
-    missing or unfit or another process trains in run_dir, DeviceUnavailable, and what `PatchSource.read` does.
+    missing or unfit, another process trains in run_dir or the run diverges (the last state is kept), DeviceUnavailable,
+    and what `PatchSource.read` does.
     """
     if batch_size % processes or (processes > 1 and device != "cpu"):
         raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
@@ -118,7 +119,7 @@ def train(
         trained = _trained_part(stage, network)
         optimiser = SOAP(trained.parameters())
         average = Average(network, _EMA_DECAY)
-        start = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
+        start = saved = load_state(state_path, network, average, optimiser, rng)["iteration"] if resuming else 0
 
         source = training_patches(archives, passed, network.distance_module)
         stage_loss: NetworkLoss = partial(_LOSSES[stage], rows=rows)
@@ -155,15 +156,18 @@ def train(
                 # On CUDA reading the loss waits for the device: only where it is reported.
                 if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
                     recent.append(loss.item())
-                    if not math.isfinite(recent[-1]):
-                        raise FloatingPointError(f"the loss is {recent[-1]} at iteration {iteration}")
                     recent_loss = recent[-1]
+                    if not math.isfinite(recent_loss):
+                        raise _diverged(f"the loss is {recent_loss}", iteration, saved, learning_rate, state_path)
                 if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
                     validation = _validate(stage_loss, network, average, fixed.to(place))
                 if iteration % _LOG_EVERY == 0 or last or stopping:
                     progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
                                 "learning_rate": learning_rate, "validation": validation}  # fmt: skip
+                    if not average.is_finite():  # the loss says so an iteration later, and the old state would be gone
+                        raise _diverged("weights are not finite", iteration, saved, learning_rate, state_path)
                     save_state(state_path, network, average, optimiser, rng, progress)
+                    saved = iteration
                     seconds = round(time.monotonic() - began, 1)
                     log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
                     file.flush()
@@ -174,6 +178,12 @@ def train(
                 if last or stopping:
                     break
     return state_path
+
+
+def _diverged(what: str, iteration: int, saved: int, learning_rate: float, state: Path) -> InvalidOptions:
+    kept = f"{state} has iteration {saved}, from which the same command goes on" if saved else "nothing was saved"
+    advice = f"give it a lower learning rate than {learning_rate:g}"
+    return InvalidOptions(f"{what} at iteration {iteration}: the run diverged; {kept}; {advice}")
 
 
 def _check_run(path: Path, stage: Stage, couplings: int) -> None:

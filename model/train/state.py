@@ -37,6 +37,10 @@ class Average:
         for name in self.tensors.keys() - set(smooth):
             self.tensors[name].copy_(self._live[name])
 
+    def is_finite(self) -> bool:
+        """Tell whether every number is, which none stays that once was not."""
+        return all(bool(mean.isfinite().all()) for mean in self.tensors.values())
+
 
 def save_state(
     path: Path, network: StraightPCF, average: Average, optimiser: torch.optim.Optimizer, rng: np.random.Generator,

@@ -16,7 +16,7 @@ CREATE TABLE IF NOT EXISTS jobs (
   deaths INTEGER NOT NULL DEFAULT 0,  -- of workers that had it: a cloud that kills them is given up, one whose server died is not
   fence INTEGER NOT NULL DEFAULT 0,
   server TEXT,                        -- who works on it
-  lease_until REAL,                   -- and until when that is believed
+  lease_until REAL,                   -- and until when that is believed: seconds since the machine began
   cancel_requested INTEGER NOT NULL DEFAULT 0,
   created_at REAL NOT NULL,
   started_at REAL,

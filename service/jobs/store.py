@@ -1,7 +1,8 @@
 """The durable store: one SQLite file in WAL mode; every method is one transaction.
 
 Calls block, so the engine makes them on a thread of their own. Several servers may share the file: a job is worked on
-by whoever holds its lease, and a write with an older fence changes nothing.
+by whoever holds its lease, and a write with an older fence changes nothing. Leases go by the machine's own clock, for
+its date may be set while a job runs; those of before it was started belong to servers that are dead.
 """
 
 from __future__ import annotations
@@ -178,12 +179,11 @@ class JobStore:
     def claim(self, server: str, lease_seconds: float) -> Claim | None:
         """Take the oldest queued job, or none."""
         with self._transaction():
-            now = time.time()
             row = self._db.execute(
                 f"UPDATE jobs SET state = 'starting', fence = MAX(fence + 1, seq * {_FENCES}), server = ?,"
                 " attempts = attempts + 1, lease_until = ?, started_at = IFNULL(started_at, ?), progress = 0"
                 " WHERE seq = (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
-                (server, now + lease_seconds, now),
+                (server, time.monotonic() + lease_seconds, time.time()),
             ).fetchone()
             return None if row is None else Claim(record=self._record(row), fence=row["fence"], deaths=row["deaths"])
 
@@ -191,7 +191,7 @@ class JobStore:
         """Renew leases, given as ids and fences; say of each whether it holds, "canceled" if its job should be."""
         holds: list[Hold] = []
         with self._transaction():
-            until = time.time() + lease_seconds  # of now: it may have waited for others' locks
+            until = time.monotonic() + lease_seconds  # of now: it may have waited for others' locks
             for id, fence in held:
                 mine = self._update(id, fence, "lease_until = ?", until)
                 holds.append("lost" if not mine else "canceled" if self._row(id)["cancel_requested"] else "held")
@@ -259,7 +259,7 @@ class JobStore:
                 f"UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0, fence = fence + 1"
                 f" WHERE state IN {_WORKING} AND (lease_until < ? OR server IN ({', '.join('?' * len(dead_servers))}))"
                 " RETURNING id",
-                (time.time(), *dead_servers),
+                (time.monotonic(), *dead_servers),
             ).fetchall()
             for row in rows:
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)

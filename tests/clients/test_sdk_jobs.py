@@ -359,6 +359,21 @@ def test_events_behind_the_last_one_are_none(client: Client) -> None:
     assert list(job.events(after=last.id)) == []
 
 
+def test_a_job_that_was_made_anew_with_fewer_events_than_were_heard_is_waited_for(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class OfLonger(flows._Watched):
+        def __init__(self, on_progress: flows.OnProgress) -> None:
+            super().__init__(on_progress)
+            self.furthest = 1000  # of the job that had this id before
+
+    monkeypatch.setattr(flows, "_Watched", OfLonger)
+    told: list[float] = []
+    job = client.jobs.create(SMALL, iterations=1)
+    assert job.wait().state == job.wait(on_progress=told.append).state == "succeeded"
+    assert told[-1] == 1.0
+
+
 def test_the_async_client_hears_of_nothing_behind_the_last_event_too(url: str) -> None:
     async def count() -> int:
         async with AsyncClient(url) as client:

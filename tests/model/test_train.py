@@ -330,3 +330,26 @@ def test_a_state_that_the_disk_has_no_room_for_is_a_files_error_and_the_old_one_
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
     path = train("vm", data=data, run_dir=tmp_path, iterations=100, batch_size=2, threads=1, minutes=0.0)
     assert read_network(path)[1]["iteration"] == 1
+
+
+@pytest.mark.parametrize("what", ["the loss is nan at iteration 3", "weights are not finite at iteration 4"])
+def test_a_run_that_diverges_says_what_to_do_and_keeps_its_last_good_state(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    monkeypatch.setattr(loop, "_LOG_EVERY", 2)
+
+    class Diverging(loop.HostStep):
+        done = 0
+
+        def __call__(self, learning_rate: float) -> torch.Tensor:
+            self.done += 1
+            if self.done == 4:  # the loss is of before the update
+                next(self._trained.parameters()).data.fill_(torch.nan)
+            return torch.tensor(torch.nan if self.done == 3 and what.startswith("the loss") else 1.0)
+
+    monkeypatch.setattr(loop, "HostStep", Diverging)
+    with pytest.raises(InvalidOptions, match=rf"{what}: .* has iteration 2, .* a lower learning rate than 0\.001"):
+        train("vm", data=data, run_dir=tmp_path, iterations=6, batch_size=1, threads=1)
+    state = tmp_path / loop.STATE_FILE
+    assert read_network(state)[1]["iteration"] == 2
+    assert all(bool(tensor.isfinite().all()) for tensor in weights(state).values())

@@ -28,3 +28,17 @@ def test_a_whole_number_of_thousands_of_digits_is_refused_by_name(field: str) ->
 def test_a_share_of_any_kind_of_number_becomes_a_float(strength: Any) -> None:
     assert DenoiseOptions(strength=strength).strength == strength
     assert type(DenoiseOptions(strength=strength).strength) is float
+
+
+@pytest.mark.parametrize("text", ["1_0", "\u0661", "\uff11", "1 0", "0x1", "", "1\u2003", "nan", "infinity"])
+@pytest.mark.parametrize("field", ["seed", "iterations", "strength"])
+def test_a_text_that_is_a_number_to_python_alone_is_refused(field: str, text: str) -> None:
+    with pytest.raises(InvalidOptions, match=rf"{field} is .*; it must be"):
+        DenoiseOptions.parse(**{field: text})
+
+
+@pytest.mark.parametrize("text", ["1", "+1", " 1 ", "01"])
+def test_plain_digits_are_taken(text: str) -> None:
+    assert DenoiseOptions.parse(seed=text, iterations=text, strength=text) == DenoiseOptions(seed=1, iterations=1)
+    for share in ("5e-1", ".5", "0.5", "+0.5E0"):
+        assert DenoiseOptions.parse(strength=share).strength == 0.5

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from straightpcf.points.errors import InvalidOptions
+from straightpcf.service.app import create_app
 from straightpcf.service.settings import Settings
 from tests.conftest import clean_environment, run_server
+from tests.service.fakes import ObedientBackend
 
 # What a pod is told of the Services straightpcf and straightpcf-grpc in its namespace.
 KUBERNETES = {
@@ -66,6 +68,22 @@ def test_a_blank_variable_is_a_setting_left_out_but_a_blank_key_file_opens_no_se
     assert Settings.from_environment(blank) == Settings()
     with pytest.raises(InvalidOptions, match="api_keys_file"):
         Settings.from_environment({"STRAIGHTPCF_API_KEYS_FILE": ""}).keys()
+
+
+def test_a_tilde_is_ones_home_also_where_no_shell_reads_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    names = ("data_dir", "weights", "api_keys_file")
+    settings = Settings.from_environment({f"STRAIGHTPCF_{name.upper()}": f"~/{name}" for name in names})
+    assert [getattr(settings, name) for name in names] == [tmp_path / name for name in names]
+    assert Settings(data_dir=Path("~")).data_dir == tmp_path
+
+
+def test_a_user_without_a_home_is_asked_for_a_data_directory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)  # as of a container's --user 12345
+    with pytest.raises(InvalidOptions, match=r"data_dir is ~/.local/share/straightpcf, .*HOME is not set"):
+        Settings()
+    assert Settings(data_dir=tmp_path).data_dir == tmp_path
 
 
 def test_what_kubernetes_and_our_other_programs_are_told_is_no_setting() -> None:
@@ -124,6 +142,33 @@ def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_wei
     assert done.returncode == 2
     assert name.lower() in done.stderr
     assert "Started server process" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[
+            ("cors_origins", each)
+            for each in ("friend.example", "https://a.example/", "http://a.example:80", "https://")
+        ],
+        *[
+            ("allowed_hosts", each)
+            for each in ("a.example:8000", "https://a.example", "*", "münchen.example", "a.example.")
+        ],
+    ],
+)
+def test_a_host_or_an_origin_that_no_browser_ever_names_keeps_a_server_from_starting(
+    name: str, value: str, tmp_path: Path
+) -> None:
+    settings = Settings(data_dir=tmp_path, **{name: f"good.example,{value}" if name == "allowed_hosts" else value})
+    with pytest.raises(InvalidOptions, match=rf"{name}: .*{re.escape(value)}"):
+        create_app(settings, backend=ObedientBackend())
+
+
+def test_hosts_and_origins_are_read_in_small_letters() -> None:
+    settings = Settings(cors_origins="*, null, HTTPS://A.example:8443", allowed_hosts="A.example, [fd00::2], 10.0.0.1")
+    assert settings.origins() == ("*", "null", "https://a.example:8443")
+    assert settings.hosts() == ("a.example", "fd00::2", "10.0.0.1")
 
 
 def test_compose_lets_a_server_end_in_peace() -> None:

@@ -12,6 +12,8 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from straightpcf.points.errors import InternalError
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.jobs.folders import JobFolders
@@ -45,6 +47,21 @@ def test_a_fence_is_void_for_every_later_job_of_its_id_too(tmp_path: Path) -> No
                 assert here.release("foo", claim.fence, "again", expires_in=60)
             there.delete("foo")
         assert len(set(held)) == len(held)
+
+
+def test_a_date_that_jumps_takes_no_job_from_who_works_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when the time is set from the network, or a virtual machine goes on after a pause."""
+    with closing(JobStore(tmp_path / "jobs")) as here, closing(JobStore(tmp_path / "jobs")) as there:
+        here.create(new_job("foo", folder="0"))
+        claim = here.claim("here", 15.0)
+        assert claim is not None
+        now = time.time
+        for jump in (3600.0, -3600.0):
+            monkeypatch.setattr(time, "time", lambda jump=jump: now() + jump)
+            assert there.recover(expires_in=60) == []
+            assert here.extend([("foo", claim.fence)], 15.0) == ["held"]
+        assert here.extend([("foo", claim.fence)], -1.0) == ["held"]
+        assert there.recover(expires_in=60) == ["foo"]  # nobody renewed it
 
 
 def test_the_locks_of_dead_servers_are_removed_also_of_those_that_held_no_job(tmp_path: Path) -> None:

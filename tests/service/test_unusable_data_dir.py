@@ -235,7 +235,7 @@ def test_a_lease_is_as_long_as_it_should_be_when_its_renewal_had_to_wait(
         record, _ = await engines.submit(engine)
         claim = await engine._call(JobStore.claim, "a-server", 5.0)
         clock = [1e9]
-        monkeypatch.setattr("straightpcf.service.jobs.store.time", SimpleNamespace(time=lambda: clock[0]))
+        monkeypatch.setattr("straightpcf.service.jobs.store.time", SimpleNamespace(monotonic=lambda: clock[0]))
         begin = JobStore._transaction
 
         def late(store: JobStore) -> Any:
