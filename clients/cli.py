@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,6 +34,7 @@ from straightpcf.clients.console import (
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
 from straightpcf.clients.stdio import STDIO, input_file, input_name, output_file
 from straightpcf.points import errors
+from straightpcf.points.device import DEVICE_NAME
 
 __all__ = ["app", "main"]
 
@@ -63,7 +63,7 @@ class _Commands(TyperGroup):
 
 def _device(text: str) -> str:
     """Refuse what is the name of no device, without the seconds that it takes to look for one."""
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
+    if not DEVICE_NAME.fullmatch(text):
         raise typer.BadParameter(f"{text!r} is none of auto, cpu, cuda and cuda:N.")
     return text
 

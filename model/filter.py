@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from straightpcf.model.on_host import OnHost
 from straightpcf.model.processor import First, Processor
 from straightpcf.model.run import MIN_POINTS, DenoiseResult, FinishedPatch, Run
 from straightpcf.model.turns import turns
+from straightpcf.points.device import DEVICE_NAME
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions
 from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
 
@@ -61,7 +61,7 @@ def load_filter(
 
 def device_named(name: str) -> str:
     """Return "cpu", "cuda" or "cuda:N" for that or "auto"; raises DeviceUnavailable for what is not here."""
-    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", name):
+    if not DEVICE_NAME.fullmatch(name):
         raise DeviceUnavailable(f'device is {name[:40]!r}; it must be "auto", "cpu", "cuda" or "cuda:N"')
     here = torch.cuda.device_count() if name != "cpu" and torch.cuda.is_available() else 0  # too old drivers count, too
     if name == "auto":

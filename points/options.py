@@ -14,9 +14,8 @@ __all__ = ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
 MAX_ITERATIONS = 10
 MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
 _ITERATIONS, _SEED, _STRENGTH = f'"auto" or 1..{MAX_ITERATIONS}', f"an integer in 0..{2**32 - 1}", "in 0..1"
-_NUMBER = re.compile(
-    r"\s*[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?\s*", re.ASCII | re.IGNORECASE
-)  # Python reads more: 1_000
+# Python reads more: 1_000, and the digits of every script.
+_NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?\s*", re.ASCII | re.IGNORECASE)
 _T = TypeVar("_T", int, float)
 
 

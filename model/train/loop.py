@@ -7,7 +7,7 @@ import csv
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -110,7 +110,8 @@ def train(
     if place.type == "cuda" and place.index is not None:  # "cuda" is the current one, and set_device takes no other
         torch.cuda.set_device(place)  # captures and Triton work on the current one
 
-    with held(run_dir):
+    with ExitStack() as lent:
+        lent.enter_context(held(run_dir))
         if resuming := state_path.exists():
             _check_run(state_path, stage, couplings)
         network = _network(stage, None if resuming else init, couplings, resuming=resuming).to(place)
@@ -132,7 +133,9 @@ def train(
         share = batch_size // processes
         team = None
         if processes > 1:
-            team = Team(processes - 1, network, trained, stage_loss, archives, share, seed, start=start, passed=passed)
+            team = lent.enter_context(
+                Team(processes - 1, network, trained, stage_loss, archives, share, seed, start=start, passed=passed)
+            )
         step: Step = (
             GraphedStep(source, loss_of, trained, optimiser, place, batch_size)
             if place.type == "cuda"
@@ -140,43 +143,43 @@ def train(
         )
         began = time.monotonic()
         validation: float | None = None
-        with (run_dir / _LOG_FILE).open("a", newline="") as file, team or nullcontext():
-            log = csv.writer(file)
-            recent: list[float] = []
-            recent_loss = math.nan
-            trained.train(not settled)
-            for iteration in range(start + 1, iterations + 1):
-                rate = _learning_rate(learning_rate, iteration, iterations)
-                loss = step(rate)
-                average.update(iteration)
-                if iteration % _TURN_EVERY == 0:
-                    optimiser.turn_bases()
-                last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
-                stopping = stop()
-                # On CUDA reading the loss waits for the device: only where it is reported.
-                if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
-                    recent.append(loss.item())
-                    recent_loss = recent[-1]
-                    if not math.isfinite(recent_loss):
-                        raise _diverged(f"the loss is {recent_loss}", iteration, saved, learning_rate, state_path)
-                if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
-                    validation = _validate(stage_loss, network, average, fixed.to(place))
-                if iteration % _LOG_EVERY == 0 or last or stopping:
-                    progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
-                                "learning_rate": learning_rate, "validation": validation}  # fmt: skip
-                    if not average.is_finite():  # the loss says so an iteration later, and the old state would be gone
-                        raise _diverged("weights are not finite", iteration, saved, learning_rate, state_path)
-                    save_state(state_path, network, average, optimiser, rng, progress)
-                    saved = iteration
-                    seconds = round(time.monotonic() - began, 1)
-                    log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
-                    file.flush()
-                    recent.clear()
-                if on_step is not None:
-                    on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
-                validation = None
-                if last or stopping:
-                    break
+        file = lent.enter_context((run_dir / _LOG_FILE).open("a", newline=""))
+        log = csv.writer(file)
+        recent: list[float] = []
+        recent_loss = math.nan
+        trained.train(not settled)
+        for iteration in range(start + 1, iterations + 1):
+            rate = _learning_rate(learning_rate, iteration, iterations)
+            loss = step(rate)
+            average.update(iteration)
+            if iteration % _TURN_EVERY == 0:
+                optimiser.turn_bases()
+            last = iteration == iterations or (minutes is not None and time.monotonic() - began >= 60 * minutes)
+            stopping = stop()
+            # On CUDA reading the loss waits for the device: only where it is reported.
+            if place.type == "cpu" or iteration % _LOG_EVERY == 0 or last or stopping:
+                recent.append(loss.item())
+                recent_loss = recent[-1]
+                if not math.isfinite(recent_loss):
+                    raise _diverged(f"the loss is {recent_loss}", iteration, saved, learning_rate, state_path)
+            if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
+                validation = _validate(stage_loss, network, average, fixed.to(place))
+            if iteration % _LOG_EVERY == 0 or last or stopping:
+                progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
+                            "learning_rate": learning_rate, "validation": validation}  # fmt: skip
+                if not average.is_finite():  # the loss says so an iteration later, and the old state would be gone
+                    raise _diverged("weights are not finite", iteration, saved, learning_rate, state_path)
+                save_state(state_path, network, average, optimiser, rng, progress)
+                saved = iteration
+                seconds = round(time.monotonic() - began, 1)
+                log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
+                file.flush()
+                recent.clear()
+            if on_step is not None:
+                on_step(TrainStep(iteration, iterations, recent_loss, validation, rate))
+            validation = None
+            if last or stopping:
+                break
     return state_path
 
 
