@@ -23,7 +23,7 @@ WORKER_KILLS = 2  # between two quiet moments: a cloud that has killed three wor
 
 def _clouds() -> list[bytes]:
     clouds = []
-    for xyz in (noisy(torus(2500), 0.01), noisy(sphere(4000), 0.02), noisy(torus(400), 0.01)):
+    for xyz in (noisy(torus(2500), 0.01), noisy(sphere(6000), 0.02), noisy(torus(400), 0.01)):
         np.save(buffer := io.BytesIO(), xyz)
         clouds.append(buffer.getvalue())
     return clouds
