@@ -31,6 +31,7 @@ __all__ = [
     "NEAR_SHARE",
     "NEAR_WEIGHT",
     "NOISE_STD",
+    "ONE_WAY",
     "OTHER_NOISE",
     "PASSED",
     "REACH",
@@ -67,6 +68,8 @@ _SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
 OTHER_NOISE = 0.25
 HEAVY_TAILED, TAILS = 0.7, (0.6, 2.0)
 UNEQUAL, STRETCH = 0.4, 0.4
+# Others of them have it along one direction only, as depth cameras and scanners do that see a flat piece.
+ONE_WAY = 0.15
 # Of a cloud that came along beams (`eye`), that share of the patches has noise along them only.
 ALONG_BEAMS = 0.7
 # The noise of clouds that first passes see, in radii of the bounding sphere.
@@ -350,6 +353,10 @@ def _scattered(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
     noise = rng.standard_normal((count, 3))
     if rng.random() >= OTHER_NOISE:
         return noise
+    if rng.random() < ONE_WAY:
+        direction = rng.standard_normal(3)
+        one_way: npt.NDArray[np.float64] = np.sqrt(3) * noise[:, :1] * direction / np.linalg.norm(direction)
+        return one_way
     if rng.random() < HEAVY_TAILED:
         shape = rng.uniform(*TAILS)
         noise *= np.sqrt(rng.gamma(shape, 1 / shape, (count, 1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from straightpcf.model.train.data import (
     NEAR_SHARE,
     NEAR_WEIGHT,
     NOISE_STD,
+    ONE_WAY,
     OTHER_NOISE,
     PASSED,
     REACH,
@@ -196,13 +198,16 @@ def _noise(clean: torch.Tensor, eyes: torch.Tensor) -> torch.Tensor:
     batch_size, count, _ = clean.shape
     device = clean.device
     noise = torch.randn(batch_size, count, 3, device=device)
-    other, heavy, unequal, shape, along = torch.rand(5, batch_size, 1, 1, device=device)
+    other, one_way, heavy, unequal, shape, along = torch.rand(6, batch_size, 1, 1, device=device)
     shape = TAILS[0] + (TAILS[1] - TAILS[0]) * shape
     variance = torch._standard_gamma(shape.expand(-1, count, -1)) / shape
     noise = torch.where((other < OTHER_NOISE) & (heavy < HEAVY_TAILED), noise * variance.sqrt(), noise)
     stds = (STRETCH * torch.randn(batch_size, 1, 3, device=device)).exp()
     stretched = noise * stds / stds.square().mean(dim=2, keepdim=True).sqrt() @ random_rotations(batch_size, device)
     noise = torch.where((other < OTHER_NOISE) & (unequal < UNEQUAL), stretched, noise)
+    direction = torch.nn.functional.normalize(torch.randn(batch_size, 1, 3, device=device), dim=2)
+    straight = math.sqrt(3) * torch.randn(batch_size, count, 1, device=device) * direction
+    noise = torch.where((other < OTHER_NOISE) & (one_way < ONE_WAY), straight, noise)
     beams = torch.nn.functional.normalize(clean - eyes, dim=2)
     return torch.where((along < ALONG_BEAMS) & beams.isfinite(), noise[:, :, :1] * beams, noise)
 

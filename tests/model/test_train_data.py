@@ -12,7 +12,7 @@ import torch
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import LARGEST_RADIUS
 from straightpcf.model.patches import PATCH_SIZE
-from straightpcf.model.train.data import EARLIEST, NOISE_STD, SCALES, Batch, PatchSource
+from straightpcf.model.train.data import EARLIEST, NOISE_STD, ONE_WAY, SCALES, Batch, PatchSource
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision
 from straightpcf.model.turns import turns
@@ -94,6 +94,8 @@ def test_a_quarter_of_the_patches_has_noise_of_other_shapes_and_the_same_size(*,
     stds = noise.std(dim=1)
     unequal = stds.amax(dim=1) / stds.amin(dim=1) > 1.25
     assert 0.03 < unequal.float().mean() < 0.25
+    one_way = torch.linalg.svdvals(noise)[:, 1] < 1e-2 * noise.shape[1] ** 0.5
+    assert 0.25 * ONE_WAY / 3 < one_way.float().mean() < 0.25 * ONE_WAY * 2
     length = (noise / stds[:, None]).square().sum(dim=2)  # of mean 3, and for Gaussian noise of variance 6
     heavy = length.var(dim=1) > 9
     assert 0.08 < heavy.float().mean() < 0.3
