@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +57,7 @@ class Reading:
     what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
     scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud.
+    raster, None of any other cloud; probes: of a scene, the patches that were read.
     """
 
     distance: float
@@ -72,6 +72,7 @@ class Reading:
     high_noise: bool = False
     uneven: bool = False
     height_axis: int | None = None
+    probes: Patches | None = None
 
 
 @dataclass(frozen=True)
@@ -201,8 +202,27 @@ class NoiseReader:
             noise, noise_of_most = self._reread_scene(positions, tiling, noise, raster=raster)
             parts = parts_of(noise, probes.radii, len(positions))
         distance = float(np.median(shown.usual_distances))
-        sampling = Sampling(irregular=True)
-        return Reading(distance, noise, True, sampling, parts=parts, noise_of_most=noise_of_most, height_axis=axis)
+        return Reading(
+            distance,
+            noise,
+            True,
+            Sampling(irregular=True),
+            parts=parts,
+            noise_of_most=noise_of_most,
+            height_axis=axis,
+            probes=probes,
+        )
+
+    def noise_left(self, positions: Floats, first: Reading, probes: Patches) -> float:
+        """Return the noise std of half of a scene's points after all passes, where it was read before: in `probes`.
+
+        A pass cuts other patches, and a scene's noise is not the same all over: of few of them half of its points may
+        seem to have more noise than before.
+        """
+        offsets = positions[probes.index] - positions[probes.seeds, None]
+        moved = replace(probes, radii=np.linalg.norm(offsets, axis=2).max(axis=1))
+        noise, _ = self._noise_of_scene(self.of_scene(positions, moved, raster=first.height_axis is not None), moved)
+        return noise
 
     def _noise_of_scene(self, shown: ScenePatches, probes: Patches) -> tuple[float, float]:
         """Return the noise std of half of a scene's points and of most: infinite where that is beyond the table."""

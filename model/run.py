@@ -181,11 +181,13 @@ class Run:
         return DenoiseResult(out, self.iterations, before, after, self.distances, untouched, seconds, tuple(warnings))
 
     def _noise_left(self, tiles: list[npt.NDArray[np.int64]]) -> float:
-        """Return the noise std of what comes out: of points that go a part of their way, read once more."""
+        """Return the noise std of what comes out: of a scene, and of points that go a part of their way, read anew."""
         first, strength = self.readings[0], self.options.strength
-        if strength in (0.0, 1.0):
+        if strength == 0.0 or (strength == 1.0 and first.probes is None):
             return (self.readings[-1] if strength else first).noise_std
         positions = self.frame.enter(self.points.xyz) + strength * self.moved
+        if first.probes is not None:
+            return self.reader.noise_left(positions, first, first.probes)
         return self.reader.read(positions, self._tiling(positions, tiles), first).noise_std
 
     @property

@@ -131,6 +131,20 @@ def test_without_zoom_a_scenes_patches_have_the_usual_size() -> None:
     np.testing.assert_allclose(shown.scales, patch_scales(cut.radii, scene=True))
 
 
+def test_the_noise_left_in_a_scene_is_read_where_its_noise_was_read() -> None:
+    xyz = bent_and_flat()
+    frame = CloudFrame.of(xyz)
+    says = SaysWhere(8e-4, 2e-4, (1.65 - frame.centre[0]) / frame.radius)  # of nearly half of the points it is loud
+    reader = NoiseReader(says, _WIDE, tile, zoom=True)  # type: ignore[arg-type]
+    positions = frame.enter(xyz)
+    first = reader.read(positions, tile(positions), None)
+    says.far, says.near = says.far / 2, says.near / 2
+    other = Tiling(positions, [np.arange(len(xyz))], coverage=3.0, seed=2)
+    assert reader.read(positions, other, first).noise_std == pytest.approx(2 * first.noise_std)  # of other patches
+    assert first.probes is not None
+    assert reader.noise_left(positions, first, first.probes) == pytest.approx(first.noise_std / 2)
+
+
 @pytest.mark.parametrize("zoom", [True, False])
 def test_without_zoom_a_raster_is_an_object_as_in_the_paper(*, zoom: bool) -> None:
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(50.0), np.arange(50.0)))

@@ -109,14 +109,18 @@ def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
     rng = np.random.default_rng(0)
     ground = rng.uniform([-5, -5, 0], [5, 5, 0], (6000, 3))
     wire = np.stack([np.linspace(-4, 4, 60), np.zeros(60), np.full(60, 1.0)], axis=1)
-    result = load_filter(device="cpu").denoise(
-        np.concatenate([noisy(ground, 0.05), noisy(wire, 0.05), far_group(300.0)]), DenoiseOptions(iterations=1)
-    )
+    cloud = np.concatenate([noisy(ground, 0.05), noisy(wire, 0.05), far_group(300.0)])
+    run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=1))
+    assert sum(len(patch.indices) for patch in run.patches()) == len(cloud)
+    result = run.result(0.0)
     height = result.xyz[:6000, 2]
     assert np.sqrt(np.mean(height**2)) < 0.4 * 0.05
     off = np.linalg.norm((result.xyz[6000:6060] - wire)[:, 1:], axis=1)
     assert np.sqrt(np.mean(off**2)) < 1.5 * np.sqrt(2) * 0.05
     assert result.noise_before == pytest.approx(0.05, rel=0.35)
+    (first, _), left = run.readings, run.frame.enter(result.xyz)
+    assert first.probes is not None
+    assert result.noise_after == pytest.approx(run.frame.radius * run.reader.noise_left(left, first, first.probes))
 
 
 def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
