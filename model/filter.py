@@ -44,7 +44,11 @@ _TURNS = 6  # positions in which a patch is shown: one an evaluation, for N = 3 
 
 
 def load_filter(
-    weights: Path | None = None, *, device: str = "auto", threads: int | None = None, tile_points: int | None = None
+    weights: str | Path | None = None,
+    *,
+    device: str = "auto",
+    threads: int | None = None,
+    tile_points: int | None = None,
 ) -> Filter:
     """Load a network, the shipped one by default, onto "cpu", "cuda" or the better one present ("auto").
 
@@ -53,7 +57,7 @@ def load_filter(
     not fit, InvalidOptions.
     """
     chosen = device_named(device)
-    path = DEFAULT_WEIGHTS if weights is None else weights
+    path = DEFAULT_WEIGHTS if weights is None else Path(weights)
     network = load_checkpoint(path, device=chosen)
     calibration = Calibration.from_metadata(read_checkpoint(path)[1])
     return Filter(network, calibration=calibration, device=chosen, threads=threads, tile_points=tile_points)

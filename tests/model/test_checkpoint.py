@@ -25,6 +25,7 @@ from straightpcf.model.checkpoint import (
     read_official_checkpoint,
     save_checkpoint,
 )
+from straightpcf.model.filter import load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
 from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import MalformedFile
@@ -55,6 +56,11 @@ def write_official(path: Path, state: dict[str, torch.Tensor]) -> Path:
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_weights_of_a_filter_may_be_named_by_text(tmp_path: Path) -> None:
+    save_checkpoint(small(), path := tmp_path / "small.safetensors")
+    assert same(load_filter(str(path), device="cpu").network.state_dict(), small().state_dict())
 
 
 def test_a_network_comes_back_with_its_weights_and_metadata(tmp_path: Path) -> None:
