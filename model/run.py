@@ -169,13 +169,14 @@ class Run:
             warnings.append(f"{held_back} points are on walls closer together than points are, and were held back")
         if self.voxel:
             warnings.append("the points are voxels: each was taken to be anywhere in its cell")
+        found = len(self.points.xyz)
+        counted = f"{found} points" if found == len(self.rows) else f"all points lie in {found} places"
         if self.frame.radius == 0.0:
             warnings.append("all points coincide: nothing to filter")
-        elif len(self.points.xyz) < MIN_POINTS:
-            places = f"all points lie in {len(self.points.xyz)} places"
-            warnings.append(f"{places}: nothing is filtered where they are fewer than {MIN_POINTS}")
-        elif len(self.points.xyz) < _FEW_POINTS:
-            warnings.append(f"{len(self.points.xyz)} points: of fewer than {_FEW_POINTS}, shape may be taken for noise")
+        elif found < MIN_POINTS:
+            warnings.append(f"{counted}: nothing is filtered where they are fewer than {MIN_POINTS}")
+        elif found < _FEW_POINTS:
+            warnings.append(f"{counted}: of fewer than {_FEW_POINTS}, shape may be taken for noise")
         before = self.frame.radius * (self.readings[0].noise_std if self.readings else 0.0)
         after = self.frame.radius * self.noise_after
         return DenoiseResult(out, self.iterations, before, after, self.distances, untouched, seconds, tuple(warnings))

@@ -216,8 +216,9 @@ def test_few_places_with_many_points_each_come_back_exactly_with_a_warning(
 
 
 def test_as_many_places_as_a_patch_has_at_least_are_filtered(tiny: Filter) -> None:
-    result = tiny.denoise(np.tile(noisy(torus(MIN_POINTS), 0.01), (3, 1)), ONE_PASS)
+    result = tiny.denoise(np.tile(noisy(torus(MIN_POINTS), 0.01), (30, 1)), ONE_PASS)
     assert result.iterations == 1
+    assert result.warnings == ("all points lie in 33 places: of fewer than 500, shape may be taken for noise",)
     assert np.isfinite(result.xyz).all()
 
 
