@@ -9,7 +9,7 @@ from pathlib import Path
 
 from straightpcf.points.errors import InvalidRequest
 
-__all__ = ["check_count", "check_path", "check_seconds", "check_silence", "check_text", "path_of"]
+__all__ = ["check_count", "check_path", "check_text", "path_of", "seconds_of", "silence_of"]
 
 _MOST_SECONDS = 10**9  # as of a server's settings: a socket takes no more of what a float can say
 
@@ -26,17 +26,19 @@ def check_count(name: str, value: object) -> None:
         raise InvalidRequest(f"{name} is {value!r:.80}; it must be a whole number, 0 or more")
 
 
-def check_silence(name: str, value: object) -> None:
-    """Raise InvalidRequest where an argument is no time that a connection can be silent, and not None either."""
+def silence_of(name: str, value: float | None) -> float | None:
+    """Return a time that a connection can be silent, or None; raises InvalidRequest where an argument is neither."""
     if value is not None and not (isinstance(value, Real) and 0 < float(value) <= _MOST_SECONDS):
         limit = f"it must be above 0, {_MOST_SECONDS:,} s at most, or None for any"
         raise InvalidRequest(f"{name} is {value!r:.80}; {limit}")
+    return None if value is None else float(value)  # sockets take no numbers of numpy
 
 
-def check_seconds(name: str, value: object) -> None:
-    """Raise InvalidRequest where an argument is neither a number of seconds, which may be over by now, nor None."""
+def seconds_of(name: str, value: float | None) -> float | None:
+    """Return a number of seconds, which may be over by now, or None; raises InvalidRequest where it is neither."""
     if value is not None and (not isinstance(value, Real) or math.isnan(value)):
         raise InvalidRequest(f"{name} is {value!r:.80}; it must be a number of seconds, or None")
+    return None if value is None else float(value)
 
 
 def check_path(name: str, value: object) -> None:

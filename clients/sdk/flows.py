@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from straightpcf.clients.sdk import request
-from straightpcf.clients.sdk.arguments import check_seconds
+from straightpcf.clients.sdk.arguments import seconds_of
 from straightpcf.clients.sdk.download import Download
 from straightpcf.clients.sdk.events import Progress
 from straightpcf.clients.sdk.job_info import JobInfo
@@ -124,8 +124,8 @@ def wait(
 
 
 def _after(timeout: float | None) -> float:
-    check_seconds("timeout", timeout)
-    return math.inf if timeout is None else time.monotonic() + timeout
+    seconds = seconds_of("timeout", timeout)
+    return math.inf if seconds is None else time.monotonic() + seconds
 
 
 @contextmanager

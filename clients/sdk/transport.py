@@ -12,7 +12,7 @@ from contextlib import aclosing
 from typing import TypeVar
 from urllib.parse import urlsplit, urlunsplit
 
-from straightpcf.clients.sdk.arguments import check_count, check_silence, check_text
+from straightpcf.clients.sdk.arguments import check_count, check_text, silence_of
 from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
@@ -32,8 +32,8 @@ def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries
     Raises InvalidOptions for a URL and a key that cannot be, InvalidRequest for what is of another kind,
     MissingDependency.
     """
-    _check(url, api_key, timeout, max_retries)
-    url = _address(url)
+    _check(url, api_key, max_retries)
+    url, timeout = _address(url), silence_of("timeout", timeout)
     if url.startswith("grpc"):
         from straightpcf.clients.sdk.grpc_transport import GrpcTransport
 
@@ -45,8 +45,8 @@ def connect(url: str, *, api_key: str | None, timeout: float | None, max_retries
 
 def connect_async(url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> AsyncTransport:
     """Do as `connect`."""
-    _check(url, api_key, timeout, max_retries)
-    url = _address(url)
+    _check(url, api_key, max_retries)
+    url, timeout = _address(url), silence_of("timeout", timeout)
     if url.startswith("grpc"):
         from straightpcf.clients.sdk.grpc_transport import AsyncGrpcTransport
 
@@ -85,10 +85,9 @@ def _address(url: str) -> str:
     return urlunsplit((parts.scheme, parts.netloc, parts.path.rstrip("/"), "", ""))
 
 
-def _check(url: str, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+def _check(url: str, api_key: str | None, max_retries: int) -> None:
     check_text("url", url)
     check_text("api_key", "" if api_key is None else api_key)
-    check_silence("timeout", timeout)
     check_count("max_retries", max_retries)
     if api_key is not None and not (api_key.isascii() and api_key.isprintable()):
         raise InvalidOptions("the API key holds more than printable ASCII, which no header can carry")

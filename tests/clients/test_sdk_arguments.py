@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from straightpcf.clients.sdk import AsyncClient, Client, Job
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.errors import ConnectionFailed, InvalidRequest
 
 NOBODY = "http://127.0.0.1:9"
 
@@ -30,9 +30,12 @@ def test_a_client_names_the_argument_that_cannot_be(argument: str, value: Any) -
             kind(**{"url": NOBODY, argument: value})
 
 
-def test_numbers_of_other_libraries_are_numbers() -> None:
-    with Client(NOBODY, timeout=np.float32(1), max_retries=np.int64(0)) as client:  # type: ignore[arg-type]
-        assert client.jobs is not None
+@pytest.mark.parametrize("url", [NOBODY, NOBODY.replace("http", "grpc")])
+def test_numbers_of_other_libraries_are_numbers(url: str) -> None:
+    with Client(url, timeout=np.float32(1), max_retries=np.int64(0)) as client:  # type: ignore[arg-type]
+        for timeout in (None, np.float32(5)):
+            with pytest.raises(ConnectionFailed):
+                client.denoise(np.zeros((40, 3)), timeout=timeout)  # type: ignore[arg-type]
 
 
 def test_a_call_names_the_argument_that_is_of_another_kind() -> None:
