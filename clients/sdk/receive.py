@@ -6,9 +6,11 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+from straightpcf.clients.sdk.arguments import check_count
 from straightpcf.clients.sdk.events import Completed, Event, parse_event
 from straightpcf.clients.sdk.retry import Failure
 from straightpcf.points.errors import ConnectionFailed, InvalidRequest, MalformedFile
+from straightpcf.points.wire.jobs import MAX_EVENT_ID
 from straightpcf.points.wire.patches import PatchFrame, PatchReader
 
 __all__ = ["Body", "Events", "Patches", "Receiver"]
@@ -72,9 +74,10 @@ class Events:
 
     def __init__(self, *, after: int = 0) -> None:
         """Begin behind event `after`; raises InvalidRequest where no event can have that number."""
-        if isinstance(after, bool) or not isinstance(after, int) or after < 0:
-            raise InvalidRequest(f"after is {after!r}; it must be the id of an event, 0 or more")
-        self.furthest = after
+        check_count("after", after)
+        if after > MAX_EVENT_ID:
+            raise InvalidRequest(f"after is {after!r:.80}; it must be the id of an event, {MAX_EVENT_ID} at most")
+        self.furthest = int(after)
         self.value: Any = None
         self._came: list[Event] = []
         self._is_over = False

@@ -20,7 +20,7 @@ from straightpcf.points.formats import format_named
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire import straightpcf_pb2_grpc as stubs
-from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
+from straightpcf.points.wire.jobs import MAX_EVENT_ID, MAX_PAGE_SIZE
 from straightpcf.points.wire.messages import (
     MAX_MESSAGE_BYTES,
     event_message,
@@ -47,7 +47,6 @@ CHUNK_BYTES = 2**18
 WRITE_BYTES = 2**20
 HEALTH_SECONDS = 0.25
 FORGETTING_SECONDS = 1.0
-MAX_EVENT_ID = 999_999_999  # as in REST
 _OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),

@@ -49,6 +49,7 @@ def test_a_call_names_the_argument_that_is_of_another_kind() -> None:
             ("target", partial(job.result, b"out.xyz")),
             ("timeout", partial(client.denoise, xyz, timeout="5")),
             ("timeout", partial(job.wait, timeout=float("nan"))),
+            *[("after", lambda after=after: next(job.events(after=after))) for after in ("1", 1.0, 10**9, 10**99)],
             ("states", lambda: list(client.jobs.list(states=5))),  # type: ignore[arg-type]
             ("state", lambda: list(client.jobs.list(states=["queued", 5]))),  # type: ignore[list-item]
             ("page_size", lambda: list(client.jobs.list(page_size="5"))),  # type: ignore[arg-type]

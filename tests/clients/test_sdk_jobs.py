@@ -118,7 +118,7 @@ def test_events_and_patches_tell_the_whole_story(client: Client) -> None:
     assert {Progress, Preview, Output} <= {type(event) for event in events}
     assert isinstance(events[-1], Completed)
     assert [event.id for event in events] == list(range(1, len(events) + 1))
-    assert list(job.events(after=events[-2].id)) == events[-1:]
+    assert list(job.events(after=np.int64(events[-2].id))) == events[-1:]  # type: ignore[arg-type]
     np.testing.assert_allclose(xyz, job.result().xyz)
     job.delete()
 
