@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.command import positive
+from benchmarks.command import file_to_write, positive
 from straightpcf.model.cpus import usable_cpus
+from straightpcf.model.filter import MIN_POINTS
 
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 FIT_FROM = 10_000  # below, one patch is most of the cloud
@@ -27,8 +28,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--points", type=positive, nargs="+", default=POINTS)
     parser.add_argument("--threads", type=positive, default=usable_cpus())
-    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--plot", type=file_to_write)
     options = parser.parse_args()
+    if min(options.points) < MIN_POINTS:
+        parser.error(f"argument --points: {min(options.points)} points; at least {MIN_POINTS} can be filtered")
     print(f"{options.threads} threads, one pass\n{'points':>9} {'seconds':>9} {'peak MiB':>9} {'points/s':>9}")
     rows = []
     for points in options.points:

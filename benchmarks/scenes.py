@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, noise_level, positive
+from benchmarks.command import errors_in_one_line, file_to_write, noise_level, positive
 from straightpcf.model.filter import load_filter
 from straightpcf.points.options import DenoiseOptions
 
@@ -346,7 +346,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--every", type=positive, default=1, help="take each n-th point only")
     parser.add_argument("--weights", type=Path, help="default: the shipped ones")
     parser.add_argument("--threads", type=positive)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=file_to_write, help="write the figures here")
     return parser
 
 

@@ -231,11 +231,17 @@ def test_a_count_of_nothing_is_a_usage_error(refused: Refused, arguments: str) -
     assert "0 is no whole number of 1 or more" in said.splitlines()[-1]
 
 
-def test_where_weights_cannot_be_written_is_said_before_they_are_made(refused: Refused, tmp_path: Path) -> None:
-    gone = tmp_path / "gone" / "weights.safetensors"
-    code, said = refused("calibrate", "--state", tmp_path / "none", "--out", gone)
+@pytest.mark.parametrize("arguments", ["calibrate --state none --out", "scenes --json", "scaling --plot"])
+def test_what_cannot_be_written_is_said_before_it_is_made(refused: Refused, arguments: str, tmp_path: Path) -> None:
+    code, said = refused(*arguments.split(), tmp_path / "gone" / "figures")
     assert code == 2
-    assert "is no folder to write weights.safetensors to" in said.splitlines()[-1]
+    assert "is no folder to write figures to" in said.splitlines()[-1]
+
+
+def test_a_cloud_too_small_to_filter_is_a_usage_error(refused: Refused) -> None:
+    code, said = refused("scaling", "--points", 1000, 32)
+    assert code == 2
+    assert "32 points; at least 33" in said.splitlines()[-1]
 
 
 def test_noise_that_is_no_number_is_a_usage_error() -> None:
