@@ -15,6 +15,9 @@ from straightpcf.service.api.request_id import usable_id
 
 __all__ = ["connection_class"]
 
+_TWO_LENGTHS = frozenset({b"content-length", b"transfer-encoding"})
+_CLOSE = (b"connection", b"close")
+
 
 def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
     """Return uvicorn's protocol with patience for what comes in, whole requests or not, from the beginning on.
@@ -32,6 +35,16 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
             super().data_received(data)
             self._be_patient()
 
+        def handle_events(self) -> None:
+            """Answer a request with two lengths as one that asks to close: a proxy may have heeded the other.
+
+            What that took for the rest of the body would else be a request of its own (RFC 9112, 6.1).
+            """
+            before = self.cycle
+            super().handle_events()
+            if self.cycle is not before and _TWO_LENGTHS.issubset(name for name, _ in self.headers):
+                self.headers.append(_CLOSE)
+
         def send_400_response(self, msg: str) -> None:
             """Answer what is no HTTP, where no answer has begun, and close."""
             if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
@@ -39,7 +52,7 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
                     self.cycle.disconnected = True  # of a body that broke off: the app's answer would be one more
                 asked = Request({"type": "http", "request_id": usable_id(None)})
                 problem = problem_response(asked, InvalidRequest(f"this is no HTTP/1.1: {sys.exc_info()[1]}"), 400)
-                head = h11.Response(status_code=400, headers=[*problem.raw_headers, (b"connection", b"close")])
+                head = h11.Response(status_code=400, headers=[*problem.raw_headers, _CLOSE])
                 for event in (head, h11.Data(data=bytes(problem.body)), h11.EndOfMessage()):
                     self.transport.write(self.conn.send(event) or b"")
             self.transport.close()

@@ -81,6 +81,26 @@ def test_what_comes_behind_an_answer_and_is_no_http_is_no_fault(
     assert not [record for record in caplog.records if record.exc_info]
 
 
+@pytest.mark.parametrize("length", [3, 1000])
+def test_one_with_two_lengths_is_closed_behind_its_answer(tmp_path: Path, length: int) -> None:
+    """Where a proxy heeds the other length, what follows is no request that it let through (RFC 9112, 6.1)."""
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (engine, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            head = b"PUT /jobs/a?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n"
+            body = b"%x\r\n%b\r\n0\r\n\r\n" % (len(CLOUD), CLOUD)
+            writer.write(head + b"Content-Length: %d\r\n\r\n" % length + body + GOOD)
+            answer = await asyncio.wait_for(reader.read(), timeout=10)  # to the end: the server closes
+            assert answer.startswith(b"HTTP/1.1 202 ")
+            assert b"connection: close" in answer
+            assert b"ready" not in answer
+            assert (await engine.get("a")).bytes == len(CLOUD)
+            writer.close()
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> None:
     async def scenario() -> None:
