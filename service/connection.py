@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import h11
 from starlette.requests import Request
@@ -27,12 +29,17 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
     """
 
     class Connection(H11Protocol):
+        _lingers = False
+
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
             self._be_patient()
 
         def data_received(self, data: bytes) -> None:
-            super().data_received(data)
+            if self._lingers:
+                self._unset_keepalive_if_required()
+            else:
+                super().data_received(data)
             self._be_patient()
 
         def handle_events(self) -> None:
@@ -42,8 +49,22 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
             """
             before = self.cycle
             super().handle_events()
-            if self.cycle is not before and _TWO_LENGTHS.issubset(name for name, _ in self.headers):
+            if self.cycle is before:
+                return
+            if _TWO_LENGTHS.issubset(name for name, _ in self.headers):
                 self.headers.append(_CLOSE)
+            self.cycle.transport = _Answering(self.transport, close=self._close_behind)  # type: ignore[assignment]
+
+        def _close_behind(self) -> None:
+            """Close behind an answer; where the body still comes, our half only, and let it come (RFC 9112, 9.6).
+
+            A closed socket answers what comes with a reset, which takes the answer away from who has not read it yet.
+            """
+            if self.conn.their_state is h11.SEND_BODY and self.cycle.response_complete:
+                self._lingers = True
+                self.transport.write_eof()
+            else:
+                self.transport.close()
 
         def send_400_response(self, msg: str) -> None:
             """Answer what is no HTTP, where no answer has begun, and close."""
@@ -63,3 +84,13 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
                 self.timeout_keep_alive_task = self.loop.call_later(idle_seconds, self.transport.close)
 
     return Connection
+
+
+class _Answering:
+    """A connection's transport, as one answer has it: closed in another way."""
+
+    def __init__(self, transport: asyncio.Transport, *, close: Callable[[], None]) -> None:
+        self._transport, self.close = transport, close
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)

@@ -101,6 +101,24 @@ def test_one_with_two_lengths_is_closed_behind_its_answer(tmp_path: Path, length
     play(scenario)
 
 
+def test_one_that_closes_behind_an_early_answer_still_takes_the_body_and_then_ends(tmp_path: Path) -> None:
+    """urllib and proxies ask to close, and read the answer when all is sent: a reset would take it from them."""
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing(), upload_idle_seconds=0.1) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(REFUSED.replace(b"1000", b"100000000\r\nConnection: close"))
+            answer = await asyncio.wait_for(reader.read(), timeout=10)  # to the end: the server says no more
+            assert answer.startswith(b"HTTP/1.1 404 ")
+            for _ in range(40):
+                writer.write(bytes(2**16))
+                await writer.drain()
+            with pytest.raises(ConnectionError):
+                await _send_now_and_then(writer, seconds=0.3)  # longer than the server waits
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> None:
     async def scenario() -> None:
@@ -137,3 +155,10 @@ def test_one_whose_peer_closes_half_of_it_is_taken_for_gone_and_frees_the_worker
             writer.close()
 
     play(scenario)
+
+
+async def _send_now_and_then(writer: asyncio.StreamWriter, *, seconds: float) -> None:
+    while True:
+        await asyncio.sleep(seconds)
+        writer.write(b"0")
+        await writer.drain()
