@@ -115,8 +115,8 @@ def denoise(
     target: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; its suffix says how; - for stdout.")],
     iterations: Iterations = "auto",
     device: Device = "auto",
-    seed: Seed = 0,
-    strength: Strength = 1.0,
+    seed: Seed = "0",
+    strength: Strength = "1.0",
     normals: Normals = "keep",
     format: Format = None,
     name: Name = None,
@@ -131,7 +131,7 @@ def denoise(
     from straightpcf.points.formats import format_by_suffix, format_named, format_wanted
     from straightpcf.points.options import DenoiseOptions
 
-    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
+    wanted = DenoiseOptions.parse(iterations=iterations, seed=seed, strength=strength, normals=normals)
     name = name or input_name(source)
     suffix = Path(name or "").suffix
     if target != STDIO:
@@ -150,8 +150,8 @@ def denoise(
         if url is not None:
             with job_commands.connect(url, api_key) as client, progress_bar(f"denoising {source.name}") as show:
                 done = client.denoise(
-                    path if name else path.read_bytes(), out, iterations=wanted.iterations, seed=seed,
-                    strength=strength, normals=wanted.normals, format=format, name=name, on_progress=show,
+                    path if name else path.read_bytes(), out, iterations=wanted.iterations, seed=wanted.seed,
+                    strength=wanted.strength, normals=wanted.normals, format=format, name=name, on_progress=show,
                 )  # fmt: skip
             report: Any = done.report
         else:
@@ -168,8 +168,8 @@ def watch(
     target: Annotated[Path | None, typer.Option("--to", help="Where results go.  [default: DIR/clean]")] = None,
     once: Annotated[bool, typer.Option("--once", help="End when nothing is left to do; exit 3 if one failed.")] = False,
     iterations: Iterations = "auto",
-    seed: Seed = 0,
-    strength: Strength = 1.0,
+    seed: Seed = "0",
+    strength: Strength = "1.0",
     normals: Normals = "keep",
     device: Device = "auto",
     weights: Annotated[Path | None, typer.Option(help="Other weights than the shipped ones.")] = None,
@@ -181,7 +181,7 @@ def watch(
     from straightpcf.clients.watch import watch_folder
     from straightpcf.points.options import DenoiseOptions
 
-    wanted = DenoiseOptions.parse(iterations=iterations, seed=str(seed), strength=str(strength), normals=normals)
+    wanted = DenoiseOptions.parse(iterations=iterations, seed=seed, strength=strength, normals=normals)
     _check_where(url, device, weights, threads)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder")

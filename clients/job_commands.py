@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,8 +36,8 @@ Key = Annotated[str | None, typer.Option("--api-key", envvar="STRAIGHTPCF_KEY", 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Id = Annotated[str, typer.Argument(metavar="ID", help="The job.")]
 Iterations = Annotated[str, typer.Option(metavar="auto|N", help="Passes of the filter.")]
-Seed = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
-Strength = Annotated[float, typer.Option(help="0..1, the share of the displacement to apply.")]
+Seed = Annotated[str, typer.Option(metavar="INTEGER", help="The same seed gives the same bytes.")]
+Strength = Annotated[str, typer.Option(metavar="FLOAT", help="0..1, the share of the displacement to apply.")]
 Normals = Annotated[str, typer.Option(metavar="keep|recompute", help="Of a PLY or PCD file that has some.")]
 Format = Annotated[str | None, typer.Option("--format", help="Of the result (ply, xyz, ...); else the input's.")]
 Name = Annotated[str | None, typer.Option("--name", help="What the input is called; text on stdin needs a suffix.")]
@@ -60,8 +61,8 @@ def connect(url: str, api_key: str | None) -> Iterator[Client]:
 def submit(
     sources: Annotated[list[Path], typer.Argument(metavar="FILE", help="The noisy clouds; - for stdin.")],
     iterations: Iterations = "auto",
-    seed: Seed = 0,
-    strength: Strength = 1.0,
+    seed: Seed = "0",
+    strength: Strength = "1.0",
     normals: Normals = "keep",
     format: Format = None,
     name: Name = None,
@@ -71,6 +72,8 @@ def submit(
     as_json: AsJson = False,
 ) -> None:
     """Hand clouds to a server and print their jobs' ids; the jobs outlive this command."""
+    from straightpcf.points.options import DenoiseOptions
+
     if id is not None and len(sources) > 1:
         raise InvalidOptions(f"--id names one job, and there are {len(sources)} files")
     if name is not None and len(sources) > 1:
@@ -78,11 +81,9 @@ def submit(
     with connect(url, api_key) as client:
 
         def hand_over(source: Path) -> None:
+            wanted = DenoiseOptions.parse(iterations=iterations, seed=seed, strength=strength, normals=normals)
             content: Any = content_of(source) if is_stream(source) else source
-            job = client.jobs.create(
-                content, iterations=iterations, seed=seed, strength=strength, normals=normals,  # type: ignore[arg-type]
-                format=format, name=name or input_name(source), id=id,
-            )  # fmt: skip
+            job = client.jobs.create(content, **asdict(wanted), format=format, name=name or input_name(source), id=id)
             print_json(job.info.json) if as_json else say(job.id)
 
         for_each(sources, hand_over)

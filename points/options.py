@@ -9,13 +9,13 @@ from typing import Literal, TypeVar
 
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
+__all__ = ["DECIMAL", "MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
 
 MAX_ITERATIONS = 10
 MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
 _ITERATIONS, _SEED, _STRENGTH = f'"auto" or 1..{MAX_ITERATIONS}', f"an integer in 0..{2**32 - 1}", "in 0..1"
 # Python reads more: 1_000, and the digits of every script.
-_NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?\s*", re.ASCII | re.IGNORECASE)
+DECIMAL = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?\s*", re.ASCII | re.IGNORECASE)
 _T = TypeVar("_T", int, float)
 
 
@@ -85,7 +85,7 @@ def _iterations(text: str) -> int | Literal["auto"]:
 
 def _number(name: str, kind: type[_T], text: str, limit: str) -> _T:
     try:
-        if not _NUMBER.fullmatch(text):
+        if not DECIMAL.fullmatch(text):
             raise ValueError(text)
         return kind(text)
     except ValueError:

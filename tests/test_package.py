@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "straightpcf": ["__version__"],
     "straightpcf.points.cloud": ["NORMALS", "PointCloud", "as_positions"],
-    "straightpcf.points.options": ["MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"],
+    "straightpcf.points.options": ["DECIMAL", "MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"],
     "straightpcf.model.filter": [
         "DEFAULT_WEIGHTS",
         "MIN_POINTS",

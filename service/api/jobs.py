@@ -28,7 +28,7 @@ from straightpcf.service.api.openapi import (
     STREAM_RESPONSES,
     problems,
 )
-from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Job, JobPage, Report
+from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Decimal, Job, JobPage, Report
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord, JobState
 
@@ -80,7 +80,7 @@ async def list_jobs(
     request: Request,
     owner: Owner,
     state: Annotated[list[JobState] | None, Query(description="Only these; may be repeated.")] = None,
-    limit: Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE)] = 50,
+    limit: Annotated[int, Decimal, Query(ge=1, le=MAX_PAGE_SIZE)] = 50,
     cursor: Annotated[str | None, Query(description="The next_cursor of the page before.")] = None,
 ) -> JobPage:
     """Show this key's jobs, newest first."""
@@ -95,7 +95,7 @@ async def get_job(
     id: str,
     request: Request,
     owner: Owner,
-    wait: Annotated[float, Query(ge=0, le=MAX_WAIT_SECONDS, description="Seconds to wait for its end.")] = 0,
+    wait: Annotated[float, Decimal, Query(ge=0, le=MAX_WAIT_SECONDS, description="Seconds to wait for its end.")] = 0,
 ) -> Job:
     """Show a job, as soon as it is finished or the wait is over."""
     engine: Engine = request.app.state.engine

@@ -5,15 +5,26 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, PlainSerializer
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 
 import straightpcf
 from straightpcf.points.formats import FORMATS
-from straightpcf.points.options import MAX_ITERATIONS
+from straightpcf.points.options import DECIMAL, MAX_ITERATIONS
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.record import JobRecord, JobState
 
-__all__ = ["MAX_WAIT_SECONDS", "FormatInfo", "Health", "Info", "Job", "JobPage", "Problem", "Report", "rfc3339"]
+__all__ = [
+    "MAX_WAIT_SECONDS",
+    "Decimal",
+    "FormatInfo",
+    "Health",
+    "Info",
+    "Job",
+    "JobPage",
+    "Problem",
+    "Report",
+    "rfc3339",
+]
 
 MAX_WAIT_SECONDS = 60  # for one request about a job
 
@@ -25,6 +36,13 @@ def rfc3339(at: datetime) -> str:
     return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
+def _decimal(text: str) -> str:
+    if not DECIMAL.fullmatch(text):
+        raise ValueError("it must be a decimal number")
+    return text
+
+
+Decimal = BeforeValidator(_decimal)  # of a number in a query: as of the options, 1_0 is none
 Time = Annotated[datetime, PlainSerializer(rfc3339, return_type=str)]
 
 

@@ -65,6 +65,9 @@ def test_an_error_is_one_line_with_its_code_and_leaves_the_old_result(tmp_path: 
     ("arguments", "code", "text"),
     [
         (["denoise", "IN", "OUT.npy", "--iterations", "0"], 2, "error [invalid_options]"),
+        (["denoise", "IN", "OUT.npy", "--seed", "1_000"], 2, "seed is '1_000'"),
+        (["watch", ".", "--once", "--strength", "0_1"], 2, "strength is '0_1'"),
+        (["submit", "IN", "--seed", "1_000"], 2, "seed is '1_000'"),
         (["denoise", "IN", "OUT.npy", "--device", "tpu"], 2, "tpu"),
         (["denoise", "IN", "OUT.npy", "--device", "cuda:99"], 4, "cuda:99"),
         (["watch", ".", "--once", "--device", "cuda:99"], 4, "cuda:99"),
