@@ -23,7 +23,7 @@ from tests.waiting import wait_for
 def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path: Path) -> None:
     page.set_input_files("#file", scan)
     page.wait_for_selector("#empty", state="hidden")
-    before = _picture(page)
+    before = picture(page)
     page.select_option("#iterations", "1")
     page.click("#submit")
     page.wait_for_selector("#report:not([hidden])")
@@ -31,7 +31,7 @@ def test_a_file_is_denoised_shown_and_downloaded(page: Any, scan: Path, tmp_path
     assert f"{POINTS:,}" in figures
     assert page.is_visible("#legend")
     page.wait_for_timeout(500)  # a frame or two of the viewer
-    after = _picture(page)
+    after = picture(page)
     assert (before != after).any(axis=2).mean() > 0.02, "the viewer still shows the noisy cloud"
     with page.expect_download() as download:
         page.click("#download")
@@ -382,7 +382,7 @@ def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
     assert (page.inner_text("#legend-low"), page.inner_text("#legend-top")) == ("1,000", "1,000")
     page.wait_for_timeout(500)  # a frame or two of the viewer
     lowest = (0x44 / 255, 0x01 / 255, 0x54 / 255)  # which fades with depth
-    assert (np.abs(_picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
+    assert (np.abs(picture(page) / 255 - lowest).max(axis=2) < 0.25).mean() > 0.02
 
 
 def _drop(page: Any, where: str, *, files: list[str] | None = None, items: list[dict[str, str]] | None = None) -> None:
@@ -395,7 +395,7 @@ def _drop(page: Any, where: str, *, files: list[str] | None = None, items: list[
     page.wait_for_timeout(300)
 
 
-def _picture(page: Any) -> np.ndarray:
+def picture(page: Any) -> np.ndarray:
     """Return the viewer's picture, (height, width, 3) uint8."""
     import io
 

@@ -86,6 +86,7 @@ export class Cloud {
   }
 
   // Centre and radius of what is there, relative to the origin: a box of the middle 99.8 %, so that strays do not count.
+  // Points in one place have the radius 1.
   bounds() {
     const samples = [[], [], []];
     this.eachSample((...point) => point.forEach((value, axis) => samples[axis].push(value)));
@@ -99,7 +100,7 @@ export class Cloud {
       centre[axis] = (low + high) / 2;
       radius += ((high - low) / 2) ** 2;
     }
-    return { centre, radius: Math.max(Math.sqrt(radius), 1e-9) };
+    return { centre, radius: Math.sqrt(radius) || 1 };
   }
 }
 

@@ -10,7 +10,7 @@ import { UNKNOWN } from "./cloud.js";
 
 const VERTEX = `
   in vec4 after;
-  uniform float blend, size, low, top, middle, radius;
+  uniform float blend, size, low, top, middle;
   uniform vec3 plain;
   uniform vec3 back;
   uniform sampler2D colours;
@@ -24,7 +24,7 @@ const VERTEX = `
     if (!there) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     vec3 colour = known ? texture(colours, vec2(clamp((after.w - low) / (top > low ? top - low : 1.0), 0.0, 1.0), 0.5)).rgb : plain;
     // What is farther away fades a little: depth without light.
-    float depth = clamp((-seen.z - middle) / (2.0 * radius) + 0.5, 0.0, 1.0);
+    float depth = clamp((-seen.z - middle) / 2.0 + 0.5, 0.0, 1.0);
     tint = mix(colour, back, 0.45 * depth);
   }
 `;
@@ -49,10 +49,8 @@ export class Viewer {
     this.renderer.sortObjects = false; // there is one; to sort it is to measure it, and NaN has no measure
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 100);
-    this.centre = new Vector3();
-    this.radius = 1;
     this.uniforms = {
-      blend: { value: 1 }, size: { value: 2 }, low: { value: 0 }, top: { value: 1 }, middle: { value: 1 }, radius: { value: 1 },
+      blend: { value: 1 }, size: { value: 2 }, low: { value: 0 }, top: { value: 1 }, middle: { value: 1 },
       plain: { value: new Color() }, back: { value: new Color() }, colours: { value: null },
     };
     this.material = new ShaderMaterial({ vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: this.uniforms, glslVersion: GLSL3 });
@@ -143,18 +141,18 @@ export class Viewer {
     this.fit();
   }
 
+  // Bring the cloud to the radius 1 about 0, whatever its unit: the controls take small moves for none. Show all of it.
   fit() {
-    const bounds = this.cloud?.bounds();
-    if (bounds) {
-      this.centre.fromArray(bounds.centre);
-      this.radius = bounds.radius;
-    }
+    const { centre, radius } = this.cloud?.bounds() ?? { centre: [0, 0, 0], radius: 1 };
+    this.points?.scale.setScalar(1 / radius);
+    this.points?.position.fromArray(centre).divideScalar(-radius);
+    this.points?.updateMatrix();
     const { y, z } = this.camera.up;
     const direction = new Vector3(0.75, z ? -1 : 0.55, y ? 1 : 0.55).normalize();
-    this.camera.position.copy(this.centre).addScaledVector(direction, this.distanceFor(direction));
-    this.controls.target.copy(this.centre);
-    this.controls.minDistance = this.radius * 1e-3;
-    this.controls.maxDistance = this.radius * 50;
+    this.camera.position.copy(direction).multiplyScalar(this.distanceFor(direction));
+    this.controls.target.set(0, 0, 0);
+    this.controls.minDistance = 1e-3;
+    this.controls.maxDistance = 50;
     this.controls.update();
     this.draw();
   }
@@ -167,13 +165,13 @@ export class Viewer {
     const needed = [];
     const point = new Vector3();
     this.cloud?.eachSample((x, y, z) => {
-      point.set(x, y, z).sub(this.centre);
+      point.set(x, y, z).applyMatrix4(this.points.matrix);
       const across = Math.max(Math.abs(point.dot(right)) / this.camera.aspect, Math.abs(point.dot(up))) / slope;
       needed.push(across + point.dot(direction));
     });
-    if (needed.length === 0) return (1.1 * this.radius) / slope;
+    if (needed.length === 0) return 1.1 / slope;
     const sorted = Float64Array.from(needed).sort();
-    return Math.max(MARGIN * sorted[Math.ceil(0.998 * (sorted.length - 1))], 1e-6 * this.radius);
+    return Math.max(MARGIN * sorted[Math.ceil(0.998 * (sorted.length - 1))], 1e-6);
   }
 
   key(event) {
@@ -217,12 +215,11 @@ export class Viewer {
   draw() {
     this.frame ??= requestAnimationFrame(() => {
       this.frame = null;
-      const distance = this.camera.position.distanceTo(this.centre);
-      this.camera.near = Math.max(distance - 3 * this.radius, distance * 1e-3, 1e-9);
-      this.camera.far = distance + 10 * this.radius;
+      const distance = this.camera.position.length();
+      this.camera.near = Math.max(distance - 3, distance * 1e-3, 1e-9);
+      this.camera.far = distance + 10;
       this.camera.updateProjectionMatrix();
       this.uniforms.middle.value = distance;
-      this.uniforms.radius.value = this.radius;
       this.renderer.render(this.scene, this.camera);
     });
   }

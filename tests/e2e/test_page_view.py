@@ -1,0 +1,43 @@
+"""The page's viewer, whatever the cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.clouds import torus
+from tests.e2e.test_page import picture
+
+
+def test_a_cloud_of_any_size_is_shown_and_moved(page: Any, tmp_path: Path) -> None:
+    box = page.locator("#canvas").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for size in (1e-4, 1e-12, 1e20):
+        shown = _shown(page, tmp_path / f"{size}.npy", torus(500) * size)
+        page.mouse.move(*middle)
+        page.mouse.down(button="right")
+        page.mouse.move(middle[0] + 40, middle[1])
+        page.mouse.up(button="right")
+        assert (shown != _drawn(page)).any(axis=2).mean() > 0.01, size
+
+
+def test_points_in_one_place_are_shown(page: Any, tmp_path: Path) -> None:
+    shown = _shown(page, tmp_path / "one.npy", np.full((3, 3), 7.0))
+    height, width, _ = shown.shape
+    middle = shown[height // 2 - 5 : height // 2 + 5, width // 2 - 5 : width // 2 + 5]
+    assert (middle != shown[5, width // 2]).any()
+
+
+def _shown(page: Any, file: Path, xyz: np.ndarray) -> np.ndarray:
+    np.save(file, xyz)
+    page.set_input_files("#file", file)
+    page.wait_for_selector(f"#note:has-text('{file.name}: {len(xyz)} points')")
+    return _drawn(page)
+
+
+def _drawn(page: Any) -> np.ndarray:
+    """Return what is seen once the frame that was asked for is drawn."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return picture(page)
