@@ -32,12 +32,12 @@ def watch_folder(
     older file, is seen to be another. A namesake that was written after its input came is let be, too: somebody may
     have worked on a result. A file is taken when its size and time have not changed for a second, so that one
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
-    server could not be had, at the next look, or, where the disk was full, when more of it is free. Yields each
-    outcome. once: look once, and end.
+    server could not be had, at the next look, or, where the disk was full or `target` away, when more of it is free
+    or it is back. Yields each outcome. once: look once, and end.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
     tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
-    full: dict[Path, int] = {}  # bytes that were free when they were not enough
+    full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
     before: dict[Path, Stamp] = {}
     while True:
         seen = {
@@ -63,6 +63,8 @@ def watch_folder(
             except Exception as error:
                 if isinstance(error, OSError) and error.errno in _NO_ROOM:
                     full[path] = shutil.disk_usage(target).free
+                elif not target.is_dir():
+                    full[path] = -1
                 else:
                     tried[path] = stamp
                 yield path, error
@@ -85,7 +87,7 @@ def _stamp(path: Path) -> Stamp | None:
 
 
 def _is_full(target: Path, free: int | None) -> bool:
-    return free is not None and shutil.disk_usage(target).free <= free
+    return free is not None and (not target.is_dir() or shutil.disk_usage(target).free <= free)
 
 
 def _is_done(path: Path, result: Path, stamp: Stamp) -> bool:

@@ -203,6 +203,14 @@ def test_a_full_disk_is_tried_again_when_more_of_it_is_free(folder: Path, monkey
     assert asked == [100, 5000]
 
 
+def test_a_folder_for_results_that_goes_away_and_comes_back_is_no_failure_of_the_file(folder: Path) -> None:
+    (folder / "clean").rmdir()
+    outcomes = watched(folder, copy)
+    assert isinstance(next(outcomes), FileNotFoundError)
+    threading.Timer(0.1, (folder / "clean").mkdir).start()  # while it looks, some ten times
+    assert next(outcomes) == "first"
+
+
 def test_a_file_that_fails_is_tried_again_only_when_it_changes(folder: Path) -> None:
     asked: list[str] = []
 
