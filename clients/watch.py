@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from straightpcf.points.errors import ConnectionFailed, ServerBusy
+from straightpcf.points.errors import ConnectionFailed, RequestTimeout, ServerBusy
 from straightpcf.points.formats import FORMATS
 
 __all__ = ["watch_folder"]
@@ -58,7 +58,7 @@ def watch_folder(
             try:
                 report = denoise(path, result)
                 os.utime(result, ns=(stamp[1], stamp[1]))
-            except (ConnectionFailed, ServerBusy) as error:
+            except (ConnectionFailed, RequestTimeout, ServerBusy) as error:
                 yield path, error
             except Exception as error:
                 if isinstance(error, OSError) and error.errno in _NO_ROOM:

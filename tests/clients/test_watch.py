@@ -20,7 +20,7 @@ import pytest
 from straightpcf.clients import watch
 from straightpcf.clients.sdk import Client, retry
 from straightpcf.clients.watch import watch_folder
-from straightpcf.points.errors import ConnectionFailed, MalformedFile, ServerBusy
+from straightpcf.points.errors import ConnectionFailed, MalformedFile, RequestTimeout, ServerBusy
 from tests.clouds import torus
 from tests.conftest import RunningServer
 
@@ -127,7 +127,7 @@ def test_a_file_system_that_keeps_no_exact_times_does_not_make_it_go_on_for_ever
     assert asked == ["first", "late"]
 
 
-@pytest.mark.parametrize("away", [ConnectionFailed("down"), ServerBusy("full")])
+@pytest.mark.parametrize("away", [ConnectionFailed("down"), RequestTimeout("slow"), ServerBusy("full")])
 def test_a_server_that_cannot_be_had_is_no_failure_of_the_file(folder: Path, away: Exception) -> None:
     answers = iter([away, away, None])
 
