@@ -375,6 +375,7 @@ def test_points_of_one_height_are_shown(page: Any, tmp_path: Path) -> None:
     flat = np.c_[np.random.default_rng(0).uniform(0, 50, (POINTS, 2)), np.full(POINTS, 1000.0)]
     np.savez(tmp_path / "flat.npz", points=flat)
     page.set_input_files("#file", tmp_path / "flat.npz")
+    page.wait_for_selector("#note:has-text('does not read .npz files: only')")  # whatever their size
     page.select_option("#iterations", "1")
     page.fill("#strength", "0")
     page.click("#submit")

@@ -6,7 +6,7 @@ import { followJob, thinning } from "./follow.js";
 import { Form } from "./form.js";
 import { forgetJob, newJobId, rememberJob, showJobs } from "./jobs.js";
 import { canRead, readFile } from "./read/reader.js";
-import { suffixOf } from "./read/index.js";
+import { READABLE, suffixOf } from "./read/index.js";
 import { offerDownload, showReport } from "./report.js";
 import { Stage } from "./stage.js";
 import * as text from "./text.js";
@@ -65,7 +65,9 @@ function readingOf(file) {
 // Return {count, stride, xyz, fault}, or {fault} where the page cannot read the file.
 async function read(file) {
   if (!canRead(file.name, file.size)) {
-    return { fault: `This page does not read ${suffixOf(file.name) || "such"} files of ${text.bytes(file.size)}: only the result will be shown.` };
+    const suffix = suffixOf(file.name);
+    const size = READABLE.includes(suffix) ? ` of ${text.bytes(file.size)}` : "";
+    return { fault: `This page does not read ${suffix || "such"} files${size}: only the result will be shown.` };
   }
   stage.note("Reading…");
   try {
