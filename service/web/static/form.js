@@ -20,7 +20,7 @@ export class Form {
     parts.file.addEventListener("change", () => choose(parts.file.files));
     parts.file.addEventListener("click", () => (parts.file.value = "")); // else the same file again is no change
     parts.strength.addEventListener("input", () => this.showStrength());
-    this.showStrength(); // browsers restore a form's values
+    addEventListener("pageshow", () => this.showStrength()); // by then browsers have restored a form's values
     for (const kind of ["dragenter", "dragover"]) {
       addEventListener(kind, (event) => {
         if (!hasFiles(event)) return;
