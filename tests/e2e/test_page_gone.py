@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from tests.conftest import RunningServer
@@ -13,3 +14,18 @@ def test_the_strength_that_is_said_is_the_one_that_a_browser_brings_back(page: A
     page.go_back()
     page.wait_for_selector("#server:has-text('version')")
     assert (page.input_value("#strength"), page.inner_text("#strength-value")) == ("0.5", "50 %")
+
+
+def test_a_server_that_is_back_is_not_said_to_be_away(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.route("**/jobs/*/events", lambda route: route.abort())
+    page.click("#submit")
+    page.wait_for_selector("#status:has-text('The connection is lost')")
+    page.route("**/jobs?*", lambda route: route.abort())
+    page.click("#jobs-refresh")
+    page.wait_for_selector("#error:has-text('does not answer')")
+    page.unroute("**/jobs/*/events")
+    page.unroute("**/jobs?*")
+    page.wait_for_selector("#report:not([hidden])")
+    assert page.is_hidden("#error")

@@ -20,6 +20,7 @@ const files = new Map(); // the file of each job that was sent since the page wa
 let latest = { file: null, reading: null }; // the file that was read last, and the promise of what is in it
 let run = null; // {id, abort} while a job is sent or followed; id is null until the server has the file
 let shown = null; // the id of the job whose result is shown
+let isAway = false; // the problem that is shown is a server that does not answer
 
 parts.form.addEventListener("submit", (event) => {
   event.preventDefault();
@@ -218,6 +219,7 @@ function listJobs() {
 }
 
 function showEvent(kind, data) {
+  if (isAway && kind !== "reconnecting") parts.error.hidden = true; // it is back
   if (kind === "queued") {
     const line = data.position ? `Waiting: ${text.plural(data.position, "job")} before this one` : "Waiting";
     say(line, null, { aloud: true });
@@ -267,6 +269,7 @@ function showProblem(problem) {
     parts["key-row"].hidden = false;
     parts.key.focus();
   }
+  isAway = problem.code === "connection_failed";
   const lines = [document.createElement("strong"), document.createElement("p")];
   lines[0].textContent = problem.detail ?? "The page met an error of its own.";
   const marks = [problem.code, problem.requestId && `request ${problem.requestId}`, problem.retryable && "worth another try"];
