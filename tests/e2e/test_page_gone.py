@@ -29,3 +29,15 @@ def test_a_server_that_is_back_is_not_said_to_be_away(page: Any, scan: Path) -> 
     page.unroute("**/jobs?*")
     page.wait_for_selector("#report:not([hidden])")
     assert page.is_hidden("#error")
+
+
+def test_a_job_that_another_deleted_can_be_deleted(page: Any, scan: Path, server: RunningServer) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.click("#submit")
+    page.locator("#jobs-list li").get_by_text("Download").wait_for()
+    server.delete_jobs()
+    page.locator("#jobs-list li").get_by_text("Delete").click()
+    page.wait_for_selector("#jobs", state="hidden")
+    assert page.is_hidden("#report")
+    assert page.is_hidden("#error")

@@ -99,7 +99,11 @@ function row(job, { name, again, onShow, onDeleted, onProblem }) {
     actions.append(link);
   }
   add("Delete", {}, async () => {
-    await call(`jobs/${encodeURIComponent(job.id)}`, { method: "DELETE" });
+    try {
+      await call(`jobs/${encodeURIComponent(job.id)}`, { method: "DELETE" });
+    } catch (problem) {
+      if (problem.status !== 404) throw problem; // else it is gone, as is wanted
+    }
     onDeleted(job);
     await again();
   });
