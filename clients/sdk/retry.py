@@ -38,6 +38,7 @@ def next_delay(failure: Failure, *, attempt: int, max_retries: int = MAX_RETRIES
     if not failure.retryable or attempt >= max_retries:
         return None
     if failure.retry_after is not None:
-        return min(failure.retry_after, MAX_RETRY_AFTER_SECONDS)
+        least = FIRST_DELAY_SECONDS if attempt else 0.0  # a proxy may name 0 for as long as its server is away
+        return min(max(failure.retry_after, least), MAX_RETRY_AFTER_SECONDS)
     delay = min(FIRST_DELAY_SECONDS * 2.0**attempt, MAX_DELAY_SECONDS)
     return delay * random.uniform(1 - JITTER, 1 + JITTER)  # many clients of one server should not come back together

@@ -302,3 +302,6 @@ def test_delays_grow_stay_bounded_and_follow_the_server() -> None:
     assert retry.next_delay(failure, attempt=9, max_retries=9) is None
     told = retry.Failure(error=ServerBusy("full"), retryable=True, retry_after=10_000.0)
     assert retry.next_delay(told, attempt=0) == retry.MAX_RETRY_AFTER_SECONDS
+    at_once = retry.Failure(error=ConnectionFailed("503"), retryable=True, retry_after=0.0)
+    assert retry.next_delay(at_once, attempt=0) == 0.0
+    assert retry.next_delay(at_once, attempt=1) == retry.FIRST_DELAY_SECONDS  # for a minute, it may be
