@@ -17,7 +17,7 @@ from straightpcf.clients.sdk.flows import Flow, Step
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import FIRST_DELAY_SECONDS, Failure, next_delay
-from straightpcf.points.errors import ConnectionFailed, InvalidOptions, InvalidRequest
+from straightpcf.points.errors import ConnectionFailed, InvalidOptions, InvalidRequest, NotFound
 
 __all__ = ["AsyncTransport", "Attempts", "Transport", "connect", "connect_async", "without_password"]
 
@@ -113,7 +113,15 @@ class Attempts:
         self._since, self._until = math.nan, call.until
         self._held_seconds = min(_HELD_SECONDS, call.silence / 2) if call.may_wait else None
         self._answered: float | None = None
+        self._deletes, self._is_unheard = call.method == "DELETE", False
         self.failure: Failure | None = None
+
+    @property
+    def is_done(self) -> bool:
+        """Tell whether the last attempt did it, or found no job to delete behind one that nobody heard the end of."""
+        if self.failure is None:
+            return True
+        return self._deletes and self._is_unheard and isinstance(self.failure.error, NotFound)
 
     def answered(self) -> None:
         """Note that an attempt is being answered."""
@@ -138,6 +146,7 @@ class Attempts:
         if delay is None or (self._until < math.inf and time.monotonic() + delay > self._until):
             raise self.failure.error from self.failure.cause
         self._attempt += 1
+        self._is_unheard = self._is_unheard or is_gone
         return delay
 
     def _was_held(self) -> bool:
@@ -197,7 +206,7 @@ class Transport(_Patience, ABC):
         while True:
             self.check_open()
             yield from self.attempt(*step, attempts)
-            if attempts.failure is None:
+            if attempts.is_done:
                 self._has_answered = True
                 return
             time.sleep(attempts.delay())
@@ -247,7 +256,7 @@ class AsyncTransport(_Patience, ABC):
             async with aclosing(self.attempt(*step, attempts)) as coming:
                 async for _ in coming:
                     yield
-            if attempts.failure is None:
+            if attempts.is_done:
                 self._has_answered = True
                 return
             await asyncio.sleep(attempts.delay())

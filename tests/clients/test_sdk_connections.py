@@ -24,6 +24,7 @@ from straightpcf.points.errors import (
     InvalidOptions,
     InvalidRequest,
     MissingDependency,
+    NotFound,
     ServerBusy,
     TooManyBytes,
 )
@@ -286,6 +287,21 @@ def test_patches_of_another_server_are_told_as_such(server: RunningServer) -> No
         proxied = client.jobs.get(job.id)
         with pytest.raises(ConnectionFailed, match="no patches of a StraightPCF server"):
             list(proxied.patches())
+
+
+def test_a_job_is_deleted_though_the_answer_to_that_is_lost(
+    server: RunningServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
+    with Client(server.url) as client:
+        job = client.jobs.create(noisy(torus(400), 0.01), iterations=1)
+    told = canned("200 OK", json.dumps(job.info.json))
+    gone = canned("404 Not Found", '{"code":"not_found","detail":"there is no such job"}')
+    with answering(told, b"", gone, BUSY, gone) as (url, _), Client(url) as client:
+        lost = client.jobs.get(job.id)
+        lost.delete()
+        with pytest.raises(NotFound):
+            lost.delete()
 
 
 def test_a_redirect_is_told_with_the_place_that_it_names() -> None:
