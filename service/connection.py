@@ -73,7 +73,8 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
                     self.cycle.disconnected = True  # of a body that broke off: the app's answer would be one more
                 asked = Request({"type": "http", "request_id": usable_id(None)})
                 problem = problem_response(asked, InvalidRequest(f"this is no HTTP/1.1: {sys.exc_info()[1]}"), 400)
-                head = h11.Response(status_code=400, headers=[*problem.raw_headers, _CLOSE])
+                headers = [*self.server_state.default_headers, *problem.raw_headers, _CLOSE]  # Date is one of them
+                head = h11.Response(status_code=400, headers=headers)
                 for event in (head, h11.Data(data=bytes(problem.body)), h11.EndOfMessage()):
                     self.transport.write(self.conn.send(event) or b"")
             self.transport.close()

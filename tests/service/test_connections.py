@@ -52,6 +52,7 @@ def test_what_is_no_http_is_told_so_by_a_problem(
             problem = json.loads(body)
             assert head.startswith(b"HTTP/1.1 400 ")
             assert b"application/problem+json" in head
+            assert b"\r\ndate: " in head  # RFC 9110, 6.6.1
             assert (problem["code"], problem["status"]) == ("invalid_request", 400)
             assert problem["request_id"].encode() in head
             assert BROKEN[broken] in problem["detail"]
