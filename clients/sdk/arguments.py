@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from numbers import Integral, Real
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from straightpcf.points.errors import InvalidRequest
 
-__all__ = ["check_count", "check_path", "check_text", "path_of", "seconds_of", "silence_of"]
+__all__ = ["check_count", "check_function", "check_path", "check_text", "path_of", "seconds_of", "silence_of"]
 
 _MOST_SECONDS = 10**9  # as of a server's settings: a socket takes no more of what a float can say
 
@@ -24,6 +25,12 @@ def check_count(name: str, value: object) -> None:
     """Raise InvalidRequest where an argument is no whole number of 0 or more."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
         raise InvalidRequest(f"{name} is {value!r:.80}; it must be a whole number, 0 or more")
+
+
+def check_function(name: str, value: object) -> None:
+    """Raise InvalidRequest where an argument is neither an ordinary function nor None: nothing awaits a coroutine."""
+    if value is not None and (not callable(value) or inspect.iscoroutinefunction(value)):
+        raise InvalidRequest(f"{name} is {value!r:.80}; it must be an ordinary function, not a coroutine's, or None")
 
 
 def silence_of(name: str, value: float | None) -> float | None:

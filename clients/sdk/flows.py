@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from straightpcf.clients.sdk import request
-from straightpcf.clients.sdk.arguments import seconds_of
+from straightpcf.clients.sdk.arguments import check_function, seconds_of
 from straightpcf.clients.sdk.download import Download
 from straightpcf.clients.sdk.events import Progress
 from straightpcf.clients.sdk.job_info import JobInfo
@@ -102,6 +102,7 @@ def wait(
     silence: seconds that the client bears, None for any; a healthy server answers within half of them. deadline: when
     the timeout is over, where it began before; on the monotonic clock.
     """
+    check_function("on_progress", on_progress)
     if on_progress is not None and timeout is None:
         told: JobInfo | None = yield request.events_call(id), _Watched(on_progress)
         if told is not None:
@@ -173,6 +174,7 @@ def denoise(
     **wanted: Any,
 ) -> Flow[Denoised]:
     """Make a job, wait for it, fetch its result and remove it; whatever ends this early ends the job too."""
+    check_function("on_progress", on_progress)
     deadline = _after(timeout)
     call = request.upload_call(source, target, until=deadline + _LATE_SECONDS, **wanted)
     id = call.path.rpartition("/")[2]

@@ -49,6 +49,8 @@ def test_a_call_names_the_argument_that_is_of_another_kind() -> None:
             ("target", partial(job.result, b"out.xyz")),
             ("timeout", partial(client.denoise, xyz, timeout="5")),
             ("timeout", partial(job.wait, timeout=float("nan"))),
+            ("on_progress", partial(client.denoise, xyz, on_progress=5)),
+            ("on_progress", partial(job.wait, on_progress=_told)),
             *[("after", lambda after=after: next(job.events(after=after))) for after in ("1", 1.0, 10**9, 10**99)],
             ("states", lambda: list(client.jobs.list(states=5))),  # type: ignore[arg-type]
             ("state", lambda: list(client.jobs.list(states=["queued", 5]))),  # type: ignore[list-item]
@@ -63,3 +65,7 @@ def test_a_call_names_the_argument_that_is_of_another_kind() -> None:
 def test_an_idempotency_key_that_no_header_carries_as_it_is_is_refused(key: str) -> None:
     with Client(NOBODY) as client, pytest.raises(InvalidRequest, match="begins or ends with a space"):
         client.jobs.create(np.zeros((40, 3)), idempotency_key=key)
+
+
+async def _told(progress: float) -> None:
+    raise AssertionError(progress)
