@@ -18,6 +18,7 @@ from straightpcf.points.errors import InvalidOptions, MalformedFile, TooFewPoint
 __all__ = ["by_stem", "opened", "read_array", "split_name", "write_archive"]
 
 _ROWS = {"eye": (3,), "frame": (4,)}  # the shapes of what is no cloud
+_MOST_EXTENT = 1e18  # its square is a float32
 _BESIDE = ("eye", "frame", "normals", "surface")
 
 
@@ -57,6 +58,8 @@ def read_array(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> npt.NDAr
         raise MalformedFile(f"{path}: {name[:80]} holds NaN or infinity")
     if what not in _BESIDE and len(values) < PATCH_SIZE:
         raise TooFewPoints(f"{path}: {name[:80]} has {len(values)} points; a training patch has {PATCH_SIZE}")
+    if what not in _BESIDE and not 0 < (extent := float(np.ptp(values, axis=0).max())) < _MOST_EXTENT:
+        raise MalformedFile(f"{path}: {name[:80]} is {extent:g} wide; it must be above 0 and below {_MOST_EXTENT:g}")
     return values
 
 

@@ -243,6 +243,8 @@ ARCHIVES: dict[str, tuple[dict[str, Any], type[InvalidCloud], str]] = {
     "two columns": ({"a/1": sphere(PATCH_SIZE)[:, :2]}, MalformedFile, r"a/1 is float64 \(1000, 2\)"),
     "whole numbers": ({"a/1": np.ones((PATCH_SIZE, 3), int)}, MalformedFile, "a/1 is int64"),
     "NaN": ({"a/1": np.full((PATCH_SIZE, 3), np.nan)}, MalformedFile, "a/1 holds NaN or infinity"),
+    "one place": ({"a/1": np.ones((PATCH_SIZE, 3))}, MalformedFile, "a/1 is 0 wide"),
+    "no float32": ({"a/1": 1e200 * sphere(PATCH_SIZE)}, MalformedFile, r"a/1 is .*e\+200 wide"),
     "objects": ({"a/1": np.array([None] * 3)}, MalformedFile, "cannot be read as NPZ"),
     "a place of beams": ({"a/eye": np.zeros((2, 3))}, MalformedFile, r"a/eye is float64 \(2, 3\); it must be \(3,\)"),
     "normals of others": (
