@@ -21,6 +21,11 @@ import pytest
 START_SECONDS = 60.0
 
 
+def pytest_configure() -> None:
+    # Two processes share the cores (pyproject.toml): threads that torch adds to the filter's own would wait for them.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
 @dataclass(frozen=True)
 class RunningServer:
     """A `straightpcf serve` process on a free port of its own."""
