@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 
-__all__ = ["POINTS"]
+__all__ = ["POINTS", "picture"]
 
 POINTS = 2500
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -55,6 +57,14 @@ def scan(tmp_path: Path) -> Path:
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {POINTS}\n{kinds}end_header\n"
     (path := tmp_path / "scan.ply").write_bytes(head.encode() + xyz.tobytes())
     return path
+
+
+def picture(page: Any) -> np.ndarray:
+    """Return the viewer's picture, (height, width, 3) uint8."""
+    from matplotlib.image import imread
+
+    png = page.locator("#canvas").screenshot()
+    return (imread(io.BytesIO(png), format="png")[..., :3] * 255).astype(np.uint8)
 
 
 def _is_fault(said: Any) -> bool:

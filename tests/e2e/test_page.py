@@ -15,7 +15,7 @@ import pytest
 from straightpcf.points.formats import read_cloud
 from tests.clouds import noisy, sphere
 from tests.conftest import RunningServer
-from tests.e2e.conftest import POINTS
+from tests.e2e.conftest import POINTS, picture
 from tests.proxy import behind_proxy
 from tests.waiting import wait_for
 
@@ -394,13 +394,3 @@ def _drop(page: Any, where: str, *, files: list[str] | None = None, items: list[
     for kind in ("dragEnter", "dragOver", "drop"):
         chromium.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})
     page.wait_for_timeout(300)
-
-
-def picture(page: Any) -> np.ndarray:
-    """Return the viewer's picture, (height, width, 3) uint8."""
-    import io
-
-    from matplotlib.image import imread
-
-    png = page.locator("#canvas").screenshot()
-    return (imread(io.BytesIO(png), format="png")[..., :3] * 255).astype(np.uint8)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tests.clouds import torus
-from tests.e2e.test_page import picture
+from tests.e2e.conftest import picture
 
 
 def test_a_cloud_of_any_size_is_shown_and_moved(page: Any, tmp_path: Path) -> None:
