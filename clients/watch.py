@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from straightpcf.points.errors import ConnectionFailed, RequestTimeout, ServerBusy
+from straightpcf.points.errors import ConnectionFailed, JobExpired, NotFound, RequestTimeout, ServerBusy
 from straightpcf.points.formats import FORMATS
 
 __all__ = ["watch_folder"]
@@ -33,11 +33,13 @@ def watch_folder(
     have worked on a result. A file is taken when its size and time have not changed for a second, so that one
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
     server could not be had, at the next look, or, where the disk was full or `target` away, when more of it is free
-    or it is back. Yields each outcome. once: look once, and end.
+    or it is back. A server that has lost a job, with its data, gets it once more. Yields each outcome. once: look
+    once, and end.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
     tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
     full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
+    lost: dict[Path, Stamp] = {}
     before: dict[Path, Stamp] = {}
     while True:
         seen = {
@@ -61,7 +63,9 @@ def watch_folder(
             except (ConnectionFailed, RequestTimeout, ServerBusy) as error:
                 yield path, error
             except Exception as error:
-                if isinstance(error, OSError) and error.errno in _NO_ROOM:
+                if isinstance(error, NotFound | JobExpired) and lost.get(path) != stamp:
+                    lost[path] = stamp
+                elif isinstance(error, OSError) and error.errno in _NO_ROOM:
                     full[path] = shutil.disk_usage(target).free
                 elif not target.is_dir():
                     full[path] = -1

@@ -109,7 +109,10 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
 
 def serve(settings: Settings) -> None:
-    """Serve until SIGINT or SIGTERM, then let running requests finish; raises what keeps every worker from starting."""
+    """Serve until SIGINT, SIGTERM or SIGHUP, then let running requests finish.
+
+    Raises what keeps every worker from starting.
+    """
     backend = _local_backend(settings)
     app = create_app(settings, backend=backend)
     for name in ("stdout", "stderr"):  # which whoever starts it may have closed: uvicorn's log wants both
@@ -122,7 +125,7 @@ def serve(settings: Settings) -> None:
         root_path=settings.root_path,
         timeout_graceful_shutdown=settings.shutdown_seconds,
         lifespan="on",
-        http=connection_class(idle_seconds=settings.upload_idle_seconds),
+        http=connection_class(settings),
         ws="none",
     )
     server = _Server(config, app.state.engine)
@@ -139,6 +142,8 @@ def serve(settings: Settings) -> None:
         )
     _check_start(settings)
     signal.signal(signal.SIGTERM, _end_well)  # uvicorn raises it anew when all is over
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # of a terminal that is closed; nohup
+        signal.signal(signal.SIGHUP, lambda number, frame: signal.raise_signal(signal.SIGTERM))
     server.run()
     if backend.failure is not None:
         raise backend.failure

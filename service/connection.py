@@ -1,8 +1,9 @@
-"""One HTTP connection: closed where nothing comes and nothing is to be answered, and where what comes is no HTTP."""
+"""One HTTP connection: closed where nothing comes or is taken for long, and where what comes is no HTTP."""
 
 from __future__ import annotations
 
 import asyncio
+import socket
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.service.api.errors import problem_response
 from straightpcf.service.api.request_id import usable_id
+from straightpcf.service.settings import Settings
 
 __all__ = ["connection_class"]
 
@@ -21,7 +23,10 @@ _TWO_LENGTHS = frozenset({b"content-length", b"transfer-encoding"})
 _CLOSE = (b"connection", b"close")
 
 
-def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
+_LONGEST_USER_TIMEOUT = 2**31 - 1  # ms, what Linux takes
+
+
+def connection_class(settings: Settings) -> type[H11Protocol]:
     """Return uvicorn's protocol with patience for what comes in, whole requests or not, from the beginning on.
 
     uvicorn's own begins with an answer and ends with the next byte, be it of half a request or of a body that was
@@ -33,6 +38,10 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; RFC 5482, of a closed window, too
+                longest = min(round(settings.download_idle_seconds * 1000) or 1, _LONGEST_USER_TIMEOUT)
+                own: socket.socket = transport.get_extra_info("socket")
+                own.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, longest)
             self._be_patient()
 
         def data_received(self, data: bytes) -> None:
@@ -82,7 +91,7 @@ def connection_class(*, idle_seconds: float) -> type[H11Protocol]:
         def _be_patient(self) -> None:
             is_answering = self.cycle is not None and not self.cycle.response_complete
             if self.timeout_keep_alive_task is None and not is_answering:
-                self.timeout_keep_alive_task = self.loop.call_later(idle_seconds, self.transport.close)
+                self.timeout_keep_alive_task = self.loop.call_later(settings.upload_idle_seconds, self.transport.close)
 
     return Connection
 

@@ -25,9 +25,13 @@ _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://([a-z0-9._-]+|\[[0-9a-f:.]+\])(:[0-9]
 _HOST = re.compile(r"[a-z0-9._-]*[a-z0-9_-]|[0-9a-f:.]*:[0-9a-f:.]*", re.ASCII)  # without a dot at its end
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
-    "max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "threads", "shutdown_seconds",
+    "max_sync_seconds", "upload_idle_seconds", "download_idle_seconds", "result_ttl_seconds", "threads",
+    "shutdown_seconds",
 )  # fmt: skip
-_SECONDS = ("max_sync_seconds", "upload_idle_seconds", "result_ttl_seconds", "row_ttl_seconds", "shutdown_seconds")
+_SECONDS = (
+    "max_sync_seconds", "upload_idle_seconds", "download_idle_seconds", "result_ttl_seconds", "row_ttl_seconds",
+    "shutdown_seconds",
+)  # fmt: skip
 _MAX_SECONDS = 1e9  # three decades; infinitely far ahead there is no date
 _MAX_WHOLE = 2**63 - 1  # what SQLite and gRPC hold
 
@@ -57,6 +61,7 @@ class Settings:
     max_spool_bytes: inputs, results and patches on the disk, or to come.  min_free_bytes: what it must then have left.
     max_sync_seconds: how long POST /denoise waits before it answers 202.
     upload_idle_seconds: how long a body that has not come to its end may bring nothing.
+    download_idle_seconds: how long a peer may take nothing of its answer over HTTP.
     result_ttl_seconds: how long a finished job's files are kept.  row_ttl_seconds: and then what is known of it.
     api_keys: comma-separated, or api_keys_file: one a line; without any, everyone may do everything.
     root_path: where a proxy, which takes it off, has the server: "/straightpcf" for https://host/straightpcf/.
@@ -82,6 +87,7 @@ class Settings:
     min_free_bytes: int = 256 * 2**20
     max_sync_seconds: float = 300.0
     upload_idle_seconds: float = 60.0
+    download_idle_seconds: float = 600.0
     result_ttl_seconds: float = 3600.0
     row_ttl_seconds: float = 86400.0
     api_keys: str = ""

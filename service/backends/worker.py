@@ -33,8 +33,9 @@ __all__ = [
     "run_worker",
 ]
 
-# Ctrl-C reaches the whole group, and so does what systemd and `timeout` send: the server says when to end.
-SERVERS_OWN = (signal.SIGINT, signal.SIGTERM)
+# Ctrl-C reaches the whole group, and so does what systemd, `timeout` and a closed terminal send: the server says when
+# to end.
+SERVERS_OWN = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 PROGRESS_INTERVAL_SECONDS = 0.05
 # More than a patch on a CPU, more than a batch of patches on a device, so that the usual path is the one that is warm.

@@ -20,7 +20,7 @@ import pytest
 from straightpcf.clients import watch
 from straightpcf.clients.sdk import Client, retry
 from straightpcf.clients.watch import watch_folder
-from straightpcf.points.errors import ConnectionFailed, MalformedFile, RequestTimeout, ServerBusy
+from straightpcf.points.errors import ConnectionFailed, JobExpired, MalformedFile, NotFound, RequestTimeout, ServerBusy
 from tests.clouds import torus
 from tests.conftest import RunningServer
 
@@ -138,6 +138,25 @@ def test_a_server_that_cannot_be_had_is_no_failure_of_the_file(folder: Path, awa
 
     outcomes = watched(folder, denoise)
     assert [next(outcomes) for _ in range(3)] == [away, away, "first"]
+
+
+@pytest.mark.parametrize("lost", [NotFound("no such job"), JobExpired("removed")])
+def test_what_a_server_has_lost_it_gets_once_more(folder: Path, lost: Exception) -> None:
+    asked: list[str] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(source.read_text())
+        if len(asked) in (1, 3, 4):
+            raise lost
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert [next(outcomes), next(outcomes)] == [lost, "first"]
+    replace(folder / "scan.ply", b"second", age=-5)
+    assert [next(outcomes), next(outcomes)] == [lost, lost]
+    replace(folder / "scan.ply", b"third", age=-10)
+    assert next(outcomes) == "third"
+    assert asked == ["first", "first", "second", "second", "third"]
 
 
 def test_a_server_that_comes_later_gets_what_was_put_there_before(

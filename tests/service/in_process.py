@@ -23,7 +23,7 @@ async def serving(folder: Path, backend: ObedientBackend, **settings: Any) -> As
     """Serve until the block ends; yield the engine, the host and the port."""
     chosen = Settings(data_dir=folder, **{"shutdown_seconds": 1} | settings)
     app = create_app(chosen, backend=backend)
-    http = connection_class(idle_seconds=chosen.upload_idle_seconds)
+    http = connection_class(chosen)
     config = uvicorn.Config(
         app, port=0, root_path=chosen.root_path, log_config=None, http=http, ws="none", timeout_graceful_shutdown=1
     )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from pathlib import Path
 
 import pytest
 
-from tests.service.engines import until
-from tests.service.fakes import ObedientBackend
+from tests.service.engines import submit, until
+from tests.service.fakes import Large, ObedientBackend
 from tests.service.in_process import serving
 from tests.service.test_races import CLOUD, POST, play, willing
 
@@ -135,6 +136,27 @@ def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> 
             answer = await asyncio.wait_for(reader.read(), timeout=20)
             assert (first + answer).count(b"HTTP/1.1 20") == 2
             writer.close()
+
+    play(scenario)
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="of Linux alone")
+def test_one_that_takes_nothing_of_its_answer_is_closed_and_one_that_takes_it_slowly_is_not(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing(Large()), download_idle_seconds=1) as (engine, host, port):
+            await submit(engine, id="a")
+            await engine.wait("a", seconds=20)
+            asked = b"GET /jobs/a/result HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+            with socket.create_connection((host, port)) as idle, socket.create_connection((host, port)) as slow:
+                for each in (idle, slow):
+                    each.sendall(asked)
+                taken = 0
+                while part := await asyncio.to_thread(slow.recv, 2**21, socket.MSG_WAITALL):
+                    taken += len(part)
+                    await asyncio.sleep(0.2)
+                assert taken > 30 << 20  # to its end
+                with idle.makefile("rb") as answer, pytest.raises(ConnectionError):
+                    await asyncio.to_thread(answer.read)
 
     play(scenario)
 

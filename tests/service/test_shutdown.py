@@ -44,18 +44,21 @@ def test_sigterm_lets_the_running_request_finish_and_leaves_nothing(tmp_path: Pa
         assert "Traceback" not in server.log.read_text()
 
 
-def test_sigterm_to_the_whole_group_lets_the_running_request_finish_too(tmp_path: Path) -> None:
-    # As systemd and `timeout` do: the worker is in the server's group.
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=["SIGTERM", "SIGHUP"])
+def test_a_signal_to_the_whole_group_lets_the_running_request_finish_too(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    # As systemd, `timeout` and a terminal that is closed do: the worker is in the server's group.
     np.save(cloud := tmp_path / "cloud.npy", noisy(torus(3000), 0.01))
     with run_server(tmp_path, within=("setsid",)) as server:
         server.wait_until_ready()
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=2"]
         request = subprocess.Popen(command, stdout=subprocess.PIPE)
         wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
-        os.killpg(server.process.pid, signal.SIGTERM)
+        os.killpg(server.process.pid, number)
         body, _ = request.communicate(timeout=60)
         assert np.load(io.BytesIO(body)).shape == (3000, 3)
-        server.process.wait(timeout=20)
+        assert server.process.wait(timeout=20) == 0
         assert "starts again" not in server.log.read_text()
 
 
