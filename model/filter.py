@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from numbers import Integral
 from pathlib import Path
 
 import numpy.typing as npt
@@ -109,10 +110,13 @@ class Filter:
         its noise, and in parts where that fills the patches (`NoiseReader`), and less than what the network asks for is
         made of steps that are more than the noise (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
-        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS, or one of threads, coverage, euler_steps and
-        full_evaluations is below 1.
+        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS, one of threads, coverage, euler_steps and
+        full_evaluations is below 1, or one of these but coverage is no whole number.
         """
         counts = {"threads": threads, "euler_steps": euler_steps, "full_evaluations": full_evaluations}
+        for name, count in {**counts, "tile_points": tile_points}.items():
+            if not isinstance(count, Integral | None):
+                raise InvalidOptions(f"{name} is {count!r}; it must be a whole number")
         for name, value in {**counts, "coverage": coverage}.items():
             if value is not None and not value >= 1:
                 raise InvalidOptions(f"{name} is {value}; it must be at least 1")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from straightpcf.points.errors import InvalidOptions
-from straightpcf.points.options import MIN_TILE_POINTS
+from straightpcf.points.options import DECIMAL, MIN_TILE_POINTS
 
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
@@ -209,7 +209,10 @@ def _usable_keys(texts: Iterable[str], setting: str) -> list[str]:
 
 def _parse(variable: str, kind: str, text: str) -> Any:
     readers = {"int": int, "float": float, "Path": Path, "str": str}
+    read = readers[kind.removesuffix(" | None")]
     try:
-        return readers[kind.removesuffix(" | None")](text)
+        if read in (int, float) and not DECIMAL.fullmatch(text):
+            raise ValueError(text)
+        return read(text)
     except ValueError:
         raise InvalidOptions(f"{variable} is {text[:40]!r}; it must be {kind}") from None

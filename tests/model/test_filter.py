@@ -363,6 +363,12 @@ def test_a_filter_is_told_what_it_needs_at_least(tiny: Filter, name: str, value:
         Filter(tiny.network, **{name: value})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("name", "value"), [("threads", 1.5), ("euler_steps", "3"), ("tile_points", 1e5)])
+def test_a_filter_takes_whole_numbers_alone(tiny: Filter, name: str, value: object) -> None:
+    with pytest.raises(InvalidOptions, match=f"{name} is {value!r}; it must be a whole number"):
+        Filter(tiny.network, **{name: value})  # type: ignore[arg-type]
+
+
 def test_options_may_be_numbers_of_numpy(tiny: Filter) -> None:
     said = DenoiseOptions(iterations=np.int64(1), seed=np.uint32(3), strength=np.float32(0.5))  # type: ignore[arg-type]
     assert said == DenoiseOptions(iterations=1, seed=3, strength=0.5)

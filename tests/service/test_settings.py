@@ -187,6 +187,8 @@ def test_compose_lets_a_server_end_in_peace() -> None:
         ("STRAIGHTPCF_PORT", "http://10.0.0.1:8000"),
         ("STRAIGHTPCF_SERVICE", "10.0.0.1"),
         ("STRAIGHTPCF_PORT", "65536"),
+        ("STRAIGHTPCF_MAX_JOBS", "1_000"),
+        ("STRAIGHTPCF_MAX_SYNC_SECONDS", "٣"),
         ("STRAIGHTPCF_MAX_JOBS", "0"),
         ("STRAIGHTPCF_MAX_POINTS", "9223372036854775808"),
         ("STRAIGHTPCF_TILE_POINTS", "9999"),
