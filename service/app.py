@@ -36,7 +36,7 @@ from straightpcf.service.api.target import TargetMiddleware
 from straightpcf.service.backends.base import Backend
 from straightpcf.service.backends.local import LocalBackend
 from straightpcf.service.backends.worker import WorkerSpec
-from straightpcf.service.connection import connection_class
+from straightpcf.service.connection import connection_class, tell_briefly
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.database import check_database
 from straightpcf.service.jobs.folders import JobFolders
@@ -63,6 +63,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        tell_briefly(asyncio.get_running_loop())
         await engine.start()
         try:
             if grpc is not None:

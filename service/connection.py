@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import math
+import resource
 import socket
 import sys
 from collections.abc import Callable
@@ -13,17 +16,39 @@ from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from straightpcf.points.errors import InvalidRequest
-from straightpcf.service.api.errors import problem_response
+from straightpcf.service.api.errors import OUT_OF_DESCRIPTORS, problem_response
 from straightpcf.service.api.request_id import usable_id
 from straightpcf.service.settings import Settings
 
-__all__ = ["connection_class"]
+__all__ = ["connection_class", "tell_briefly"]
 
 _TWO_LENGTHS = frozenset({b"content-length", b"transfer-encoding"})
 _CLOSE = (b"connection", b"close")
-
-
 _LONGEST_USER_TIMEOUT = 2**31 - 1  # ms, what Linux takes
+_TOLD_AGAIN_SECONDS = 10.0
+
+logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
+
+
+def tell_briefly(loop: asyncio.AbstractEventLoop) -> None:
+    """Let an event loop say in a line, and seldom, that connections wait for a file descriptor.
+
+    asyncio itself tries each second as often as a listener may have connections wait, with a traceback each time:
+    megabytes of log.
+    """
+    told = -math.inf
+
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        nonlocal told
+        fault = context.get("exception")
+        if not (isinstance(fault, OSError) and fault.errno in OUT_OF_DESCRIPTORS and "socket" in context):
+            loop.default_exception_handler(context)
+        elif loop.time() - told >= _TOLD_AGAIN_SECONDS:
+            told = loop.time()
+            most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            logger.warning("connections wait: %s (this process may have %d: ulimit -n)", fault.strerror, most)
+
+    loop.set_exception_handler(handle)
 
 
 def connection_class(settings: Settings) -> type[H11Protocol]:

@@ -28,6 +28,7 @@ from straightpcf.service.api.schemas import Problem
 
 __all__ = [
     "GRPC_STATUS_BY_CODE",
+    "OUT_OF_DESCRIPTORS",
     "PROBLEM_MEDIA_TYPE",
     "RETRY_AFTER_SECONDS",
     "STATUS_BY_CODE",
@@ -112,7 +113,7 @@ GRPC_STATUS_BY_CODE: Mapping[str, str] = {
 
 _KINDS: Mapping[int, type[StraightPCFError]] = {404: NotFound, 405: MethodNotAllowed}
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-_USED_UP = frozenset({errno.EMFILE, errno.ENFILE})
+OUT_OF_DESCRIPTORS = frozenset({errno.EMFILE, errno.ENFILE})
 _UNUSABLE = frozenset(
     {errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOENT, errno.ENOTDIR, errno.EIO, errno.ESTALE, errno.ENODEV}
 )
@@ -177,7 +178,7 @@ async def _system(request: Request, error: Exception) -> Response:
 
 def busy(error: OSError | sqlite3.Error) -> ServerBusy | None:
     """Return what to say of an error that passes: others let go of their files, or an operator mends the disk."""
-    if isinstance(error, OSError) and error.errno in _USED_UP:
+    if isinstance(error, OSError) and error.errno in OUT_OF_DESCRIPTORS:
         told = "the server has no file descriptor left for this request"
     elif _is_unusable(error):
         told = "the server's data directory cannot be used at the moment; its log says why"

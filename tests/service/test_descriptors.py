@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import resource
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +15,10 @@ import pytest
 
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
+from tests.service.engines import until
+from tests.service.in_process import serving
 from tests.service.rest import npy
+from tests.service.test_races import play, willing
 
 if not hasattr(resource, "prlimit"):
     pytest.skip("only Linux limits another process", allow_module_level=True)
@@ -23,7 +29,13 @@ CLOUD = npy(noisy(torus(300), 0.01))
 @contextmanager
 def no_descriptor_left(server: RunningServer) -> Iterator[None]:
     """Keep a server from opening anything; what is open stays so."""
-    pid, kind = server.process.pid, resource.RLIMIT_NOFILE
+    with _at_most_as_many_as_now(server.process.pid):
+        yield
+
+
+@contextmanager
+def _at_most_as_many_as_now(pid: int) -> Iterator[None]:
+    kind = resource.RLIMIT_NOFILE
     before = resource.prlimit(pid, kind)
     used = {int(path.name) for path in Path(f"/proc/{pid}/fd").iterdir()}
     resource.prlimit(pid, kind, (min(set(range(len(used) + 1)) - used), before[1]))
@@ -64,3 +76,26 @@ def test_a_call_for_which_no_descriptor_is_left_may_be_made_again(server: Runnin
             stub.CreateJob(iter(parts))
         assert caught.value.code().name == "UNAVAILABLE"
         assert stub.CreateJob(iter(parts)).id
+
+
+def test_connections_that_wait_for_a_descriptor_are_a_line_of_the_log_and_taken_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("asyncio.constants.ACCEPT_RETRY_DELAY", 0.05)
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (_, host, port):
+            with socket.socket() as waiting:  # which has its own descriptor by now
+                waiting.setblocking(False)
+                with _at_most_as_many_as_now(os.getpid()):
+                    await asyncio.get_running_loop().sock_connect(waiting, (host, port))
+                    await until(lambda: "connections wait: Too many open files" in caplog.text)
+                reader, writer = await asyncio.open_connection(sock=waiting)
+                writer.write(b"GET /livez HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+                assert b" 200 OK" in await asyncio.wait_for(reader.read(), timeout=10)
+                writer.close()
+
+    play(scenario)
+    told = [record for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
+    assert [record.getMessage().partition(" (")[0] for record in told] == ["connections wait: Too many open files"]
+    assert not any(record.exc_info for record in told)
