@@ -59,7 +59,8 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
 
     telemetry = Telemetry(engine)
     gate = Gate(settings.keys(), rate_per_minute=settings.rate_per_minute)
-    grpc = _grpc_server(settings, engine, gate, telemetry)
+    coming = Coming(engine)
+    grpc = _grpc_server(settings, engine, coming, gate, telemetry)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -87,7 +88,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         if isinstance(route, Route) and route.methods:
             route.methods.add("HEAD")  # as everywhere
     app.state.engine = engine
-    app.state.coming = Coming()
+    app.state.coming = coming
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
     origins, hosts = settings.origins(), settings.hosts()
@@ -188,7 +189,9 @@ def _quiet_when_cut_off(app: ASGIApp) -> ASGIApp:
     return quiet
 
 
-def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Telemetry) -> GrpcServer | None:
+def _grpc_server(
+    settings: Settings, engine: Engine, coming: Coming, gate: Gate, telemetry: Telemetry
+) -> GrpcServer | None:
     if settings.grpc_port is None:
         return None
     try:
@@ -197,6 +200,7 @@ def _grpc_server(settings: Settings, engine: Engine, gate: Gate, telemetry: Tele
         raise MissingDependency(f"gRPC needs an extra: pip install 'straightpcf[grpc]' ({exc})") from exc
     return GrpcServer(
         engine,
+        coming=coming,
         gate=gate,
         telemetry=telemetry,
         weights=_weights_name(settings),

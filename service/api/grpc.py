@@ -34,7 +34,7 @@ from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.body import SpoolFile, in_time, next_part
 from straightpcf.service.api.download import open_result
 from straightpcf.service.api.grpc_call import Caller, Context, answering
-from straightpcf.service.api.intake import file_name
+from straightpcf.service.api.intake import Coming, file_name
 from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Info, Job, rfc3339
 from straightpcf.service.engine import Engine, JobRequest
 from straightpcf.service.jobs.record import JobEvent, JobRecord
@@ -63,9 +63,11 @@ logger = logging.getLogger("uvicorn.error")
 class GrpcServer:
     """Listen on a port of its own, with health checking (grpc.health.v1) and reflection; lives on the event loop."""
 
-    def __init__(self, engine: Engine, *, gate: Gate, telemetry: Telemetry, weights: str, host: str, port: int) -> None:
+    def __init__(
+        self, engine: Engine, *, coming: Coming, gate: Gate, telemetry: Telemetry, weights: str, host: str, port: int
+    ) -> None:
         self._engine = engine
-        self._service = DenoiseService(engine, gate=gate, telemetry=telemetry, weights=weights)
+        self._service = DenoiseService(engine, coming=coming, gate=gate, telemetry=telemetry, weights=weights)
         self._host, self._wanted = f"[{host}]" if ":" in host else host, port
         self._health = health.aio.HealthServicer()
         self._watch: asyncio.Task[None] | None = None
@@ -113,8 +115,9 @@ class GrpcServer:
 class DenoiseService(stubs.DenoiseServiceServicer):
     """Answer the calls of straightpcf.v1.DenoiseService (points/wire/straightpcf.proto)."""
 
-    def __init__(self, engine: Engine, *, gate: Gate, telemetry: Telemetry, weights: str) -> None:
-        self._engine, self._gate, self._telemetry, self._weights = engine, gate, telemetry, weights
+    def __init__(self, engine: Engine, *, coming: Coming, gate: Gate, telemetry: Telemetry, weights: str) -> None:
+        self._engine, self._coming = engine, coming
+        self._gate, self._telemetry, self._weights = gate, telemetry, weights
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()
@@ -149,7 +152,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 self._engine.lend(private, owner=caller.owner)
             try:
                 id = private or config.job.id or None
-                record, _ = await self._take(config.job, requests, caller, endpoint="denoise", id=id)
+                record = await self._take(config.job, requests, caller, endpoint="denoise", id=id)
                 await context.write(pb.DenoiseResponse(accepted=_job(record)))
                 if config.patches:
                     async for patch in self._patches(record):
@@ -173,8 +176,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
         """Commit a job."""
         async with self._answering(context, "CreateJob") as caller:
             config = (await in_time(self._engine, _first(requests, self._engine))).config
-            record, _ = await self._take(config, requests, caller, endpoint="jobs", id=config.id or None)
-            return _job(record)
+            return _job(await self._take(config, requests, caller, endpoint="jobs", id=config.id or None))
 
     async def GetJob(self, request: pb.GetJobRequest, context: Context) -> pb.Job:  # noqa: N802
         """Show a job, now or at its end."""
@@ -217,7 +219,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
     async def DeleteJob(self, request: pb.DeleteJobRequest, context: Context) -> Empty:  # noqa: N802
         """Forget a job."""
         async with self._answering(context, "DeleteJob") as caller:
-            await self._engine.delete(request.id, owner=caller.owner)
+            await self._coming.delete(caller.owner, request.id)
             return Empty()
 
     async def StreamPatches(self, request: pb.StreamPatchesRequest, context: Context) -> None:  # noqa: N802
@@ -247,8 +249,14 @@ class DenoiseService(stubs.DenoiseServiceServicer):
 
     async def _take(
         self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, *, endpoint: str, id: str | None
-    ) -> tuple[JobRecord, bool]:
-        """Spool the file and commit the job."""
+    ) -> JobRecord:
+        """Spool the file and commit the job; raises NotFound where it is deleted meanwhile."""
+        taking = self._receive(config, requests, caller, endpoint, id)
+        return (await self._coming.take(caller.owner, id, taking))[0]
+
+    async def _receive(
+        self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, endpoint: str, id: str | None
+    ) -> tuple[JobRecord, bool, None]:
         engine = self._engine
         options = DenoiseOptions(**plain_of(config.options))
         if config.format:
@@ -267,7 +275,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 endpoint=endpoint,
                 traceparent=caller.traceparent,
             )
-            return await engine.submit(source, wanted)
+            return *await engine.submit(source, wanted), None
 
     async def _progress(self, record: JobRecord) -> AsyncIterator[pb.Progress]:
         async for event in self._engine.events(record.id, owner=record.owner):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import PurePosixPath, PureWindowsPath
+from typing import TypeVar
 
 from starlette.requests import Request
 
@@ -23,33 +23,45 @@ KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
 MAX_NAME_LENGTH = 120
 MAX_KEY_LENGTH = 255
 
+_T = TypeVar("_T")
+
 
 class Coming:
-    """Know the jobs whose files are on their way: one that is deleted meanwhile is not to be.
+    """Know the jobs whose files are on their way, by whichever transport: one that is deleted meanwhile is not to be.
 
     Who cancels an upload deletes its job over another connection, and the rest of the file may still lie in buffers.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
         self._jobs: dict[object, tuple[str, str]] = {}  # owner and id, by upload
 
-    @contextmanager
-    def noted(self, owner: str, id: str | None) -> Iterator[Callable[[], bool]]:
-        """Note an upload; lends what tells whether its job was deleted since."""
+    async def take(
+        self, owner: str, id: str | None, taking: Awaitable[tuple[JobRecord, bool, _T]]
+    ) -> tuple[JobRecord, bool, _T]:
+        """Return what an upload makes; raises NotFound where its job is deleted meanwhile."""
         upload = object()
         if id is not None:
             self._jobs[upload] = (owner, id)
         try:
-            yield lambda: id is not None and upload not in self._jobs
+            record, created, more = await taking
+            if created and id is not None and upload not in self._jobs:
+                await self._engine.delete(record.id, owner=owner)
+                raise NotFound(f"job {record.id} was deleted while its file was on its way")
         finally:
             self._jobs.pop(upload, None)
+        return record, created, more
 
-    def delete(self, owner: str, id: str) -> bool:
-        """Let none of the uploads of a job make it; return whether there are any."""
+    async def delete(self, owner: str, id: str) -> None:
+        """Delete a job, and let none of its uploads make it; raises NotFound where there is neither."""
         uploads = [upload for upload, job in self._jobs.items() if job == (owner, id)]
         for upload in uploads:
             del self._jobs[upload]
-        return bool(uploads)
+        try:
+            await self._engine.delete(id, owner=owner)
+        except NotFound:
+            if not uploads:
+                raise
 
 
 async def take_job(
@@ -60,13 +72,7 @@ async def take_job(
     Raises NotFound where the job is deleted meanwhile.
     """
     coming: Coming = request.app.state.coming
-    with coming.noted(owner, id) as is_deleted:
-        record, created, fields = await _take(request, owner, endpoint, id, more_fields)
-        if created and is_deleted():
-            engine: Engine = request.app.state.engine
-            await engine.delete(record.id, owner=owner)
-            raise NotFound(f"job {record.id} was deleted while its file was on its way")
-    return record, created, fields
+    return await coming.take(owner, id, _take(request, owner, endpoint, id, more_fields))
 
 
 async def _take(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
-from straightpcf.points.errors import InvalidRequest, NotFound
+from straightpcf.points.errors import InvalidRequest
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.service.api.auth import owner_of
 from straightpcf.service.api.download import open_result, result_response
@@ -138,14 +138,8 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
 @router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")
 async def delete_job(id: str, request: Request, owner: Owner) -> None:
     """Remove a job, its files and its events, whatever its state; also one whose file is still on its way."""
-    engine: Engine = request.app.state.engine
     coming: Coming = request.app.state.coming
-    is_coming = coming.delete(owner, id)
-    try:
-        await engine.delete(id, owner=owner)
-    except NotFound:
-        if not is_coming:
-            raise
+    await coming.delete(owner, id)
 
 
 async def _result(id: str, request: Request, owner: Owner) -> Response:

@@ -58,6 +58,31 @@ def test_a_call_that_is_cancelled_while_its_job_is_committed_leaves_none(
     play(scenario)
 
 
+def test_a_job_that_is_deleted_by_either_transport_while_its_file_is_on_its_way_is_none(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, willing(), grpc_port=(port := free_port())) as (engine, host, http),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+            httpx2.AsyncClient(base_url=f"http://{host}:{http}") as client,
+        ):
+            stub = DenoiseServiceStub(channel)
+            calls: dict[str, Any] = {id: stub.CreateJob() for id in ("a", "b")}
+            for id, call in calls.items():
+                await call.write(pb.CreateJobRequest(config=pb.JobConfig(id=id, filename="a.xyz")))
+                await call.write(pb.CreateJobRequest(chunk=CLOUD))
+            await until(lambda: len(list((tmp_path / "incoming").iterdir())) == len(calls))
+            assert (await client.delete("/jobs/a")).status_code == 204
+            await stub.DeleteJob(pb.DeleteJobRequest(id="b"))
+            for call in calls.values():
+                await call.done_writing()
+                with pytest.raises(grpc.RpcError) as caught:
+                    await call
+                assert caught.value.code().name == "NOT_FOUND"
+            await nothing_is_left(engine)
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("kind", ["Denoise", "DownloadResult"])
 def test_a_result_that_is_deleted_before_it_is_opened_is_not_found(
     tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
