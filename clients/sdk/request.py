@@ -64,6 +64,7 @@ class Call:
     timeout: seconds of silence to bear, None for the client's own. silence: those to bear at least.
     events: the answer is a stream of events. may_wait: one that is held open with nothing to say is none that failed.
     once: do not try again. until: give up then, on the monotonic clock.
+    written: when the body, a file, was written last (ns).
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -79,6 +80,7 @@ class Call:
     may_wait: bool = False
     once: bool = False
     until: float = math.inf
+    written: int = 0
     request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def all_headers(self) -> dict[str, str]:
@@ -94,9 +96,9 @@ class Call:
         return own if math.isinf(left) else left if own is None else min(own, left)
 
     def chunks(self) -> Generator[bytes]:
-        """Read the body; raises InvalidRequest where a file is no longer as large as the headers say, OSError."""
+        """Read the body; raises InvalidRequest where a file is another than when the call was made, OSError."""
         if isinstance(self.body, Path):
-            yield from _read_chunks(self.body, int(self.headers["Content-Length"]))
+            yield from _read_chunks(self.body, int(self.headers["Content-Length"]), self.written)
         elif self.body is not None:
             yield from (self.body[at : at + CHUNK_BYTES] for at in range(0, len(self.body), CHUNK_BYTES))
 
@@ -154,7 +156,11 @@ def upload_call(
         raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
     if key is not None and key != key.strip():
         raise InvalidRequest(f"the idempotency key begins or ends with a space: {key[:40]!r}")
-    size = body.stat().st_size if isinstance(body, Path) else len(body)
+    if isinstance(body, Path):
+        status = body.stat()
+        size, written = status.st_size, status.st_mtime_ns
+    else:
+        size, written = len(body), 0
     headers = {
         "Content-Type": "application/octet-stream",
         "Content-Length": str(size),
@@ -167,7 +173,7 @@ def upload_call(
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
     return Call(
         method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body,
-        until=until,
+        until=until, written=written,
     )  # fmt: skip
 
 
@@ -278,13 +284,17 @@ def _sendable(name: str | Path | None) -> str | None:
     return None if name is None else os.fspath(name).encode("utf-8", "replace").decode()
 
 
-def _read_chunks(path: Path, size: int) -> Generator[bytes]:
+def _read_chunks(path: Path, size: int, written: int) -> Generator[bytes]:
+    changed = f"{path} changed while it was read"
     with path.open("rb") as file:
         left = size
         while left > 0 and (chunk := file.read(min(CHUNK_BYTES, left))):
             left -= len(chunk)
-            if left == 0 and file.read(1):
-                break  # before the server has what would look whole
+            if left == 0:  # before the server has what would look whole, and may be the halves of two clouds
+                if file.read(1):
+                    raise InvalidRequest(f"{changed}: it had {size} bytes before")
+                if os.fstat(file.fileno()).st_mtime_ns != written:
+                    raise InvalidRequest(f"{changed}: somebody wrote into it, or replaced it")
             yield chunk
-        if left > 0 or file.tell() > size:
-            raise InvalidRequest(f"{path} changed while it was read: it had {size} bytes before")
+        if left > 0:
+            raise InvalidRequest(f"{changed}: it had {size} bytes before")

@@ -52,7 +52,7 @@ def test_an_upload_that_is_cancelled_while_its_file_is_read_is_cancelled(
     (tmp_path / "scan.xyz").write_text("0 0 0\n" * 50)
     reading, may_go_on = threading.Event(), threading.Event()
 
-    def slowly(path: Path, size: int) -> Iterator[bytes]:
+    def slowly(path: Path, size: int, written: int) -> Iterator[bytes]:
         reading.set()
         may_go_on.wait(10)
         yield path.read_bytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -12,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from straightpcf.clients.sdk import Client, retry
-from straightpcf.points.errors import ConnectionFailed
+from straightpcf.clients.sdk import Client, request, retry
+from straightpcf.points.errors import ConnectionFailed, InvalidRequest
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 
@@ -110,6 +111,34 @@ def test_a_file_that_arrives_damaged_is_fetched_again(server: RunningServer, don
     whole = done.result().content
     with cutting_proxy(server.url, limits=repeat(10**9), damage=20_000) as (url, _), Client(url) as client:
         assert client.jobs.get(done.id).result().content == whole
+
+
+@pytest.mark.parametrize("how", ["in place", "replaced"])
+def test_a_file_that_becomes_another_of_its_size_while_it_is_sent_is_named(
+    tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan, read = tmp_path / "scan.xyz", request._read_chunks
+    scan.write_bytes(b"0 0 0\n" * 10)
+    os.utime(scan, ns=(1, 1))
+    monkeypatch.setattr(request, "CHUNK_BYTES", 6)
+
+    def written_meanwhile(path: Path, size: int, written: int) -> Iterator[bytes]:
+        if how == "replaced":  # as between two attempts
+            (tmp_path / "other.xyz").write_bytes(b"1 1 1\n" * 10)
+            (tmp_path / "other.xyz").replace(path)
+        for number, chunk in enumerate(read(path, size, written)):
+            if how == "in place" and number == 4:
+                with path.open("r+b") as file:
+                    file.write(b"1 1 1\n" * 10)
+            yield chunk
+
+    monkeypatch.setattr(request, "_read_chunks", written_meanwhile)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        Client(f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=5) as client,
+        pytest.raises(InvalidRequest, match=r"scan\.xyz changed while it was read: somebody wrote into it"),
+    ):
+        client.jobs.create(scan)
 
 
 def test_a_call_that_never_gets_on_is_given_up_and_leaves_no_file(
