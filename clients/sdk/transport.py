@@ -234,19 +234,31 @@ class AsyncTransport(_Patience, ABC):
         """Do as `Transport.attempt`."""
 
     async def run(self, flow: Flow[_T]) -> _T:
-        """Do as `Transport.run`."""
+        """Do as `Transport.run`.
+
+        A scope of anyio, as of Starlette's requests and `move_on_after`, cancels its task again at each step: not those
+        with which a flow that is cancelled ends its work on the server.
+        """
+        from anyio import CancelScope
+        from anyio.lowlevel import checkpoint_if_cancelled
+
         try:
             step = next(flow)
-            while True:
-                try:
-                    async for _ in self.stream(step):
-                        pass
-                except BaseException as error:
-                    step = flow.throw(error)
-                else:
-                    step = flow.send(step[1].value)
+            with CancelScope() as scope:
+                while True:
+                    try:
+                        async for _ in self.stream(step):
+                            pass
+                    except BaseException as error:
+                        scope.shield = isinstance(error, asyncio.CancelledError)
+                        step = flow.throw(error)
+                    else:
+                        step = flow.send(step[1].value)
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
+        except asyncio.CancelledError:
+            await checkpoint_if_cancelled()  # raises that of the scope, which knows its own alone; gRPC makes another
+            raise
 
     async def stream(self, step: Step) -> AsyncGenerator[None]:
         """Do as `Transport.stream`."""

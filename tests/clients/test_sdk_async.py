@@ -11,9 +11,13 @@ from types import SimpleNamespace
 
 import httpx2
 import pytest
+from anyio import CancelScope
 
 from straightpcf.clients.sdk import AsyncClient, AsyncJob, http_transport, request, retry
 from straightpcf.points.errors import ConnectionFailed, InvalidRequest
+from tests.service.engines import until
+from tests.service.fakes import ObedientBackend
+from tests.service.in_process import free_port, serving
 
 HEALTHY = b'HTTP/1.1 200 OK\r\nContent-Length: 29\r\nConnection: close\r\n\r\n{"status":"ok","ready":true}\n'
 STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n: here\n\n"
@@ -70,6 +74,35 @@ def test_an_upload_that_is_cancelled_while_its_file_is_read_is_cancelled(
 
     with socket.create_server(("127.0.0.1", 0)) as silent:
         asyncio.run(use(f"http://127.0.0.1:{silent.getsockname()[1]}"))
+
+
+def test_a_scope_of_anyio_that_cancels_a_call_ends_its_work_on_the_server(tmp_path: Path) -> None:
+    (scan := tmp_path / "scan.xyz").write_text("0 0 0\n" * 50)
+
+    async def canceled_in_a_scope(url: str, backend: ObedientBackend) -> None:
+        backend.runs.clear()
+        with CancelScope() as scope:
+
+            async def cancel_once_it_runs() -> None:
+                await until(lambda: backend.runs)
+                scope.cancel()
+
+            canceling = asyncio.create_task(cancel_once_it_runs())
+            async with AsyncClient(url) as client:
+                await client.denoise(scan)
+        await canceling
+        assert scope.cancelled_caught
+
+    async def scenario() -> None:
+        backend = ObedientBackend()
+        backend.go.set()
+        async with serving(tmp_path / "data", backend, grpc_port=(grpc := free_port())) as (engine, host, http):
+            for url in (f"http://{host}:{http}", f"grpc://{host}:{grpc}"):
+                await canceled_in_a_scope(url, backend)
+                assert not (await engine.list())[0]
+            assert len(backend.canceled) == 2
+
+    asyncio.run(asyncio.wait_for(scenario(), timeout=20))
 
 
 def test_more_streams_than_a_pool_holds_keep_no_other_call_waiting_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
