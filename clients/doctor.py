@@ -34,6 +34,8 @@ def examine() -> tuple[dict[str, Any], bool]:
         findings |= _examine_model()
     except ModuleNotFoundError as exc:
         return findings | {"problem": f"{exc.name} is not installed; pip install 'straightpcf[model]'"}, False
+    except ImportError as exc:
+        return findings | {"problem": f"what straightpcf[model] brings cannot be loaded: {exc}"}, False
     except StraightPCFError as exc:
         return findings | {"problem": f"[{exc.code}] {exc.message}"}, False
     except OSError as exc:

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from straightpcf.points.errors import InternalError, JobCanceled, StraightPCFError, TooLarge
+from straightpcf.points.errors import InternalError, JobCanceled, MissingDependency, StraightPCFError, TooLarge
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob, FileReport
 from straightpcf.service.backends.denoise_file import denoise_file
@@ -138,8 +138,10 @@ def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
 def _load(spec: WorkerSpec) -> Filter:
     import numpy as np
 
-    from straightpcf.model.filter import load_filter
-
+    try:
+        from straightpcf.model.filter import load_filter
+    except ImportError as exc:  # another process would meet it, too
+        raise MissingDependency(f"what straightpcf[model] brings cannot be loaded: {exc}") from exc
     denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads, tile_points=spec.tile_points)
     count, options = WARM_UP_POINTS, DenoiseOptions()
     if denoiser.device != "cpu":  # between passes points are spread, which is compiled there, too

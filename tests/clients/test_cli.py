@@ -19,7 +19,16 @@ from straightpcf.clients.cli import app
 from straightpcf.clients.console import EXIT_CODES, exit_code
 from straightpcf.clients.doctor import EXTRAS
 from straightpcf.model.kernels import cpu
-from straightpcf.points.errors import ERRORS_BY_CODE, DeviceUnavailable, InternalError, InvalidOptions, ServerBusy
+from straightpcf.points.errors import (
+    ERRORS_BY_CODE,
+    DeviceUnavailable,
+    InternalError,
+    InvalidOptions,
+    MissingDependency,
+    ServerBusy,
+)
+from straightpcf.service.backends import worker
+from straightpcf.service.backends.worker import WorkerSpec
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
 
@@ -190,6 +199,23 @@ def test_doctor_says_why_there_are_no_kernels(monkeypatch: pytest.MonkeyPatch, t
     finally:
         cpu.load.cache_clear()
     assert "no C++ compiler: install g++" in json.loads(done.stdout)["kernels"]
+
+
+def test_a_torch_that_cannot_be_loaded_is_named_wherever_it_is_wanted(
+    scan: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "torch.py").write_text("raise ImportError('libcudart.so.12: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for module in ("torch", "straightpcf.model.filter"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    said = "what straightpcf[model] brings cannot be loaded: libcudart.so.12: cannot open shared object file"
+    done = CliRunner().invoke(app, ["doctor", "--json"])
+    assert (done.exit_code, json.loads(done.stdout)["problem"]) == (4, said)
+    done = CliRunner().invoke(app, ["denoise", str(scan), str(tmp_path / "clean.npy")])
+    assert (done.exit_code, done.stderr) == (4, f"error [missing_dependency]: {said}\n")
+    with pytest.raises(MissingDependency) as caught:  # which ends the server, as a device that is not here does
+        worker._load(WorkerSpec(device="cpu", weights=None, threads=1))
+    assert caught.value.message == said
 
 
 def test_doctor_looks_for_what_pyproject_asks_for() -> None:
