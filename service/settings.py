@@ -124,6 +124,8 @@ class Settings:
         for name in ("port", "grpc_port"):
             if not 0 <= (getattr(self, name) or 0) < 2**16:
                 raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be in 0..65535 (0: any free one)")
+        if self.port and self.port == self.grpc_port:
+            raise InvalidOptions(f"port and grpc_port are both {self.port}; each must be one of its own")
         if not _ROOT_PATH.fullmatch(self.root_path):
             raise InvalidOptions(
                 f"root_path is {self.root_path[:80]!r}; it must be like /straightpcf, with no / at its end"

@@ -70,6 +70,12 @@ def test_a_blank_variable_is_a_setting_left_out_but_a_blank_key_file_opens_no_se
         Settings.from_environment({"STRAIGHTPCF_API_KEYS_FILE": ""}).keys()
 
 
+def test_one_port_is_not_for_both_transports_but_any_free_ones_are() -> None:
+    with pytest.raises(InvalidOptions, match="port and grpc_port are both 8000"):
+        Settings(grpc_port=8000)
+    assert Settings(port=0, grpc_port=0).grpc_port == 0
+
+
 def test_a_tilde_is_ones_home_also_where_no_shell_reads_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     names = ("data_dir", "weights", "api_keys_file")
