@@ -84,12 +84,16 @@ class OpenedFile:
     def _look(self) -> tuple[bytes | None, tuple[int, int]]:
         """Return how far the -wal is moved into the database (sqlite.org/walformat.html), and when that was written.
 
-        In this order: what is written after the look is said to be moved after it, too. None while it is being moved.
+        None while it is being moved, also where that began between two looks at it: another thread or server may do it.
         """
+        before = self._moved()
+        stat = self._path.stat()
+        return before if before == self._moved() else None, (stat.st_size, stat.st_mtime_ns)
+
+    def _moved(self) -> bytes | None:
         head = b"" if self._shm is None else os.pread(self._shm, _WAL_INDEX_HEAD, 0)
         salts, done, begun = head[32:40], head[96:100], head[128:132]
-        stat = self._path.stat()
-        return salts + done if head and done == begun else None, (stat.st_size, stat.st_mtime_ns)
+        return salts + done if head and done == begun else None
 
 
 def check_database(path: Path) -> None:

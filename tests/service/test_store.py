@@ -16,6 +16,7 @@ import pytest
 
 from straightpcf.points.errors import InternalError
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.jobs.database import OpenedFile
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import NewJob
 from straightpcf.service.jobs.store import JobStore
@@ -158,6 +159,27 @@ def test_servers_that_start_at_once_on_an_old_file_all_do(tmp_path: Path) -> Non
             for store in pool.map(JobStore, [path] * 3):
                 assert store.load().bytes == 12
                 store.close()
+
+
+def test_what_another_server_moves_into_the_database_during_a_look_is_no_overwriting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, read = tmp_path / "jobs.sqlite3", os.pread
+    with closing(JobStore(path)) as store, closing(JobStore(path)) as other:
+        store.create(new_job("one", folder="one"))
+        os.utime(path, ns=(1, 1))  # so that what is written next is seen, whatever the clock's ticks
+        opened = OpenedFile(path)
+
+        def moved_behind(handle: int, size: int, offset: int) -> bytes:
+            head = read(handle, size, offset)
+            other.empty_wal()
+            return head
+
+        monkeypatch.setattr(os, "pread", moved_behind)
+        opened.check()
+        assert path.stat().st_mtime_ns > 1
+        opened.check()
+    opened.close()  # behind the database
 
 
 def test_what_every_upload_asks_for_is_answered_by_an_index(tmp_path: Path) -> None:
