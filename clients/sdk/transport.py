@@ -242,18 +242,19 @@ class AsyncTransport(_Patience, ABC):
         from anyio import CancelScope
         from anyio.lowlevel import checkpoint_if_cancelled
 
+        canceled = False
         try:
             step = next(flow)
-            with CancelScope() as scope:
-                while True:
-                    try:
+            while True:
+                try:
+                    with CancelScope(shield=canceled):
                         async for _ in self.stream(step):
                             pass
-                    except BaseException as error:
-                        scope.shield = isinstance(error, asyncio.CancelledError)
-                        step = flow.throw(error)
-                    else:
-                        step = flow.send(step[1].value)
+                except BaseException as error:
+                    canceled = canceled or isinstance(error, asyncio.CancelledError)
+                    step = flow.throw(error)
+                else:
+                    step = flow.send(step[1].value)
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
         except asyncio.CancelledError:
