@@ -13,7 +13,7 @@ import torch
 from straightpcf.model.allocator import keep_large_buffers
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
-from straightpcf.model.cpus import usable_cpus
+from straightpcf.model.cpus import usable_cpus, use_one_thread_if_forked
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
@@ -57,6 +57,7 @@ def load_filter(
     tile_points: see Filter. Raises DeviceUnavailable for a device that is not here, MalformedFile for weights that do
     not fit, InvalidOptions.
     """
+    use_one_thread_if_forked()
     chosen = device_named(device)
     path = DEFAULT_WEIGHTS if weights is None else Path(weights)
     network = load_checkpoint(path, device=chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,7 +29,10 @@ class OnHost:
 
     def __init__(self, network: Network, threads: int) -> None:
         self._network, self._threads = network, threads
-        self._pool = ThreadPoolExecutor(threads, initializer=_one_thread)
+        self._make_pool()
+
+    def _make_pool(self) -> None:
+        self._pool, self._process = ThreadPoolExecutor(self._threads, initializer=_one_thread), os.getpid()
 
     def displacements(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
@@ -84,6 +88,8 @@ class OnHost:
 
     def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
         """Map in order, few results waiting."""
+        if self._process != os.getpid():  # a fork has none of its parent's threads
+            self._make_pool()
         waiting: deque[Future[_T]] = deque()
         try:
             for item in items:

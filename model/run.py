@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
@@ -78,6 +79,7 @@ class Run:
     """One cloud on its way through the filter."""
 
     def __init__(self, owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> None:
+        use_one_thread_if_forked()
         xyz = as_positions(points).astype(np.float64, copy=False)
         self.filter, self.options, self.xyz = owner, options, xyz
         self.rows = np.flatnonzero(np.isfinite(xyz).all(axis=1))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from straightpcf.model.cpus import usable_cpus
@@ -58,3 +60,29 @@ def test_no_more_threads_look_up_neighbours_than_a_filter_has(monkeypatch: pytes
 def test_normals_do_not_depend_on_the_threads() -> None:
     xyz = sphere(2000)
     np.testing.assert_array_equal(recompute_normals(xyz, xyz, workers=2), recompute_normals(xyz, xyz))
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12's, of any fork beside threads
+def test_a_forked_process_denoises_as_its_parent_does() -> None:
+    """Threads do not come along: neither the filter's own nor OpenMP's, for which torch would wait for ever."""
+    filter, cloud = Filter(StraightPCF(width=16, distance_width=16), threads=2), noisy(torus(200), 0.01)
+    options, many = DenoiseOptions(iterations=1), torch.ones(1 << 17)
+    expected = filter.denoise(cloud, options).xyz
+    assert (many + many).sum() == 1 << 18  # more than torch gives to one thread
+    context = multiprocessing.get_context("fork")
+    results = context.SimpleQueue()
+
+    def work() -> None:
+        found = filter.denoise(cloud, options).xyz
+        results.put((found, float((many + many).sum())))
+
+    child = context.Process(target=work, daemon=True)
+    child.start()
+    child.join(30)
+    if child.is_alive():
+        child.kill()
+        pytest.fail("the forked process hangs")
+    found, total = results.get()
+    np.testing.assert_array_equal(found, expected)
+    assert total == 1 << 18
