@@ -52,7 +52,10 @@ class NpzSource:
 
 
 class Npz(Format):
-    """Read and write NPZ; the positions are the first of KEYS that can be, or the only array (N, >= 3)."""
+    """Read and write NPZ; the positions are the first of KEYS that can be, or the only array (N, >= 3) there is.
+
+    Refused is one that is so called and has such rows of whole numbers or objects: the only one is something else then.
+    """
 
     name = "npz"
     suffixes = (".npz",)
@@ -142,12 +145,14 @@ def _members(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
     fitting = {_key(member): member for member in members if _can_be_positions(archive, member)}
     named = next((key for key in KEYS if key in fitting), None)
-    if named or len(fitting) == 1:
-        return fitting[named or next(iter(fitting))]
+    if named:
+        return fitting[named]
     by_name = {_key(member): member for member in members}
-    called = next((key for key in KEYS if key in by_name), None)
-    if called and not fitting:
-        return by_name[called]  # reading it says what is wrong with it
+    called = [key for key in KEYS if key in by_name and (not fitting or _has_rows(archive, by_name[key]))]
+    if called:
+        return by_name[called[0]]  # reading it says what is wrong with it
+    if len(fitting) == 1:
+        return next(iter(fitting.values()))
     if not members:
         held = ", ".join(archive.namelist())[:200]
         raise UnsupportedCloud(
@@ -164,6 +169,13 @@ def _can_be_positions(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bool
     if not head.startswith(MAGIC) or _key(member).lower().startswith(_NO_POSITIONS):
         return False
     return read_header(head, where=f"array {member.filename[:80]}").is_positions
+
+
+def _has_rows(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bool:
+    """Tell whether positions may be what this array holds, of whatever type: beside it, others are none (features)."""
+    head = _head(archive, member)
+    shape = read_header(head, where=f"array {member.filename[:80]}").shape if head.startswith(MAGIC) else ()
+    return len(shape) == 2 and shape[1] >= 3
 
 
 def _head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:

@@ -202,6 +202,12 @@ BAD: dict[str, tuple[bytes, type[StraightPCFError], str]] = {
     "no positions": (npz(label=np.arange(5)), UnsupportedCloud, "label"),
     "normals alone": (npz(normals=np.ones((5, 3))), UnsupportedCloud, "0 arrays.*normals"),
     "two candidates": (npz(a=np.zeros((5, 3)), b=np.zeros((5, 3))), UnsupportedCloud, "2 arrays.*a, b"),
+    "voxels and features": (
+        npz(coords=np.zeros((5, 3), np.int32), feats=torus(5)),
+        UnsupportedCloud,
+        r"coords\.npy has shape \(5, 3\) and type <i4",
+    ),
+    "objects and vectors": (npz(points=torus(5).astype(object), flow=torus(5)), UnsupportedCloud, "never unpickled"),
     "object positions": (npz(points=np.array([{}, None], dtype=object)), UnsupportedCloud, "never unpickled"),
 }
 
