@@ -6,6 +6,7 @@ A new format is one file with a `Format` and one line in FORMATS; the contract t
 from __future__ import annotations
 
 import errno
+import re
 import struct
 from pathlib import Path, PurePath
 
@@ -47,6 +48,9 @@ _NOT_OURS = {
     ".pcd.bin": "a nuScenes sweep has five float32 a point, where a KITTI frame (.bin) has four; "
     "as (N, 5) float32 in a .npy file it can be taken"
 }
+
+# CloudCompare's own, which it saves by default, under the suffix of KITTI's frames: CCB2 and the like.
+_CLOUDCOMPARE = re.compile(rb"CCB[0-?]")
 
 # How files begin that hold another one.
 _PACKED = {
@@ -150,6 +154,8 @@ def recognised(head: bytes, called: str | None) -> Format:
     for magic, packer in _PACKED.items():
         if head.startswith(magic):
             raise UnknownFormat(f"{name[:80]} is packed with {packer}: unpack it first")
+    if _CLOUDCOMPARE.match(head):
+        raise UnknownFormat(f"{name[:80]} is a BIN file of CloudCompare's own: save it as PLY or LAS there")
     begins, suffix = f"{name[:80]} begins with {head[:8]!r}, which no format does", PurePath(name).suffix.lower()
     for ending, why in _NOT_OURS.items():
         if name.lower().endswith(ending):

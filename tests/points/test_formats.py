@@ -178,6 +178,13 @@ def test_a_packed_file_is_said_to_be_one_whatever_it_is_called(name: str, tmp_pa
             read_cloud(path)
 
 
+def test_a_bin_file_of_cloudcompares_is_called_so(tmp_path: Path) -> None:
+    """Its rows can be four float32, too, of which the fourth are no intensities."""
+    (path := tmp_path / "scan.bin").write_bytes(b"CCB2" + bytes(60))
+    with pytest.raises(UnknownFormat, match=r"scan\.bin is a BIN file of CloudCompare's own: save it as PLY"):
+        read_cloud(path)
+
+
 def test_a_name_of_any_length_keeps_its_suffix(tmp_path: Path) -> None:
     (path := tmp_path / "input").write_bytes(b"0 0 0\n")
     assert read_cloud(path, name="long " * 40 + ".xyz")[1].name == "xyz"
