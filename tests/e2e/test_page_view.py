@@ -30,6 +30,13 @@ def test_points_in_one_place_are_shown(page: Any, tmp_path: Path) -> None:
     assert (middle != shown[5, width // 2]).any()
 
 
+def test_a_long_name_does_not_widen_the_page(page: Any, tmp_path: Path) -> None:
+    (file := tmp_path / f"{'a_name_without_a_break_' * 9}.txt").write_text("0 0 0\n1 1 1\n")
+    page.set_input_files("#file", file)
+    page.wait_for_selector(f"#note:has-text('{file.name}: 2 points')")
+    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
+
+
 def _shown(page: Any, file: Path, xyz: np.ndarray) -> np.ndarray:
     np.save(file, xyz)
     page.set_input_files("#file", file)
