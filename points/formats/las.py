@@ -21,9 +21,10 @@ from straightpcf.points.formats.las_layout import (
     is_geographic,
     read_header,
 )
-from straightpcf.points.formats.las_new import TYPES, check_new, new_las, renamed
+from straightpcf.points.formats.las_new import TAKEN, TYPES, check_new, new_las, renamed
 from straightpcf.points.formats.laz_codec import check_packing, pack, packing_record, unpack
 from straightpcf.points.formats.positions import AXES, moved
+from straightpcf.points.formats.scalars import not_held
 
 __all__ = ["Las", "Laz"]
 
@@ -79,7 +80,9 @@ class Las(Format):
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name nothing of a file that is only packed or unpacked."""
-        return [] if isinstance(cloud.source, LasSource) else [*super().left_behind(cloud), *renamed(cloud)]
+        if isinstance(cloud.source, LasSource):
+            return []
+        return [*cloud.beside, *not_held(cloud.attributes, self.types, taken=TAKEN), *renamed(cloud)]
 
     def check(self, cloud: PointCloud) -> None:
         """Raise UnsupportedCloud where no new file can be written; LAZ wants its library, too, and a known layout."""

@@ -16,11 +16,12 @@ from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.scalars import scalar_columns
 
-__all__ = ["TYPES", "check_new", "new_las", "renamed"]
+__all__ = ["TAKEN", "TYPES", "check_new", "new_las", "renamed"]
 
 FINEST_USUAL_SCALE = 1e-4
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
+TAKEN = ("x", "y", "z", "X", "Y", "Z")  # laspy calls positions and their integers so
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 # What laspy calls the bytes of bit fields, and parts of its own record: it opens no file with such dimensions.
 _RESERVED = ("bit_fields", "raw_classification", "header", "scales", "offsets")
@@ -69,7 +70,7 @@ def _laid_out(
 
     The last by the names that they have now.
     """
-    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=("x", "y", "z", "X", "Y", "Z"))
+    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=TAKEN)
     has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
     has_time = "gps_time" in columns and _is_double(columns["gps_time"])
     point_format = 2 * has_rgb + has_time

@@ -41,10 +41,12 @@ def scalar_columns(
     return columns
 
 
-def not_held(attributes: Mapping[str, npt.NDArray[Any]], types: Collection[str]) -> list[str]:
+def not_held(
+    attributes: Mapping[str, npt.NDArray[Any]], types: Collection[str], *, taken: Collection[str] = AXES
+) -> list[str]:
     """Name the attributes that `scalar_columns` leaves out, or whose numbers or names come out as others."""
     lost: list[str] = []
-    labels = [*AXES]
+    labels = [*taken]
     for name, values in attributes.items():
         kind, changes = values.dtype.str[1:], []
         if values.dtype.kind not in "biuf":

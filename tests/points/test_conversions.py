@@ -83,6 +83,7 @@ def test_columns_whose_names_las_has_no_room_for_are_named(target: str, tmp_path
     said = ["intensity (renamed to extra_intensity)", f"{distance} (renamed to {distance[:32]})"]
     said.append(f"{distance}_2 (renamed to {distance[:30]}_2)")
     assert format_named(target).left_behind(cloud) == said
+    assert format_named(target).left_behind(PointCloud(torus(3), {"X": np.ones(3)})) == ["X (renamed to X_2)"]
     again = converted(cloud, target, tmp_path).attributes
     for index, name in enumerate(["extra_intensity", distance[:32], f"{distance[:30]}_2"]):
         np.testing.assert_array_equal(again[name], half + index)
