@@ -61,6 +61,7 @@ def save_checkpoint(
     partial.replace(path)
 
 
+@torch.inference_mode(mode=False)  # tensors made in it are never packed for the kernels
 def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> StraightPCF:
     """Rebuild the network a file describes, in inference mode; raises MalformedFile naming what does not fit."""
     state, metadata = read_checkpoint(path)
@@ -167,7 +168,7 @@ def _architecture(sizes: Any, path: Path) -> dict[str, int]:
 
 def _filled(model: _Module, state: Mapping[str, torch.Tensor], path: Path) -> _Module:
     """Put `state` into `model` once every key, shape and type agrees and every value is finite."""
-    expected = model.state_dict()
+    expected = model.float().state_dict()  # whatever torch.set_default_dtype says
     if unknown := sorted(state.keys() - expected.keys()):
         raise MalformedFile(f"{path} has {len(unknown)} tensors the network has not: {_some(unknown)}")
     if missing := sorted(expected.keys() - state.keys()):

@@ -73,7 +73,7 @@ def _farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
 def farthest_torch(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
     """Do what `kernels.cuda.farthest` does for any number of points; the loop never waits for the device."""
     seeds = torch.empty(wanted, dtype=torch.int64, device=points.device)
-    nearest = torch.full((len(points),), torch.inf, device=points.device)
+    nearest = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
     last = torch.tensor([first], device=points.device)
     for n in range(wanted):
         seeds[n : n + 1] = last
@@ -97,7 +97,9 @@ def _owners(distance: torch.Tensor, index: torch.Tensor, count: int) -> torch.Te
     radius = distance[:, -1:]
     ratio = (distance / torch.where(radius > 0, radius, 1)).flatten()
     rows = index.flatten()
-    best = torch.full((count,), torch.inf, device=ratio.device).scatter_reduce(0, rows, ratio, "amin")
+    best = torch.full((count,), torch.inf, dtype=ratio.dtype, device=ratio.device).scatter_reduce(
+        0, rows, ratio, "amin"
+    )
     patch = torch.arange(len(index), device=rows.device).repeat_interleave(index.shape[1])
     patch = torch.where(ratio == best[rows], patch, len(index))
     return torch.full((count,), len(index), device=rows.device).scatter_reduce(0, rows, patch, "amin")

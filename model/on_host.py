@@ -45,7 +45,7 @@ class OnHost:
         heard: list[tuple[torch.Tensor, torch.Tensor]] = []  # of each patch its own points' first velocities, and d
 
         def known(patch: int) -> torch.Tensor | None:
-            return torch.tensor([[known_distances[patch]]]) if patch in known_distances else None
+            return torch.tensor([[known_distances[patch]]], dtype=torch.float32) if patch in known_distances else None
 
         def begin(joined: Agreement, patch: int) -> tuple[torch.Tensor, ...]:
             x, distance = _cut_out(points, cut, scales, patch), known(patch)

@@ -24,4 +24,4 @@ def turns(count: int) -> torch.Tensor:
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ])  # fmt: skip
-    return torch.tensor(matrices)
+    return torch.tensor(matrices, dtype=torch.float32)

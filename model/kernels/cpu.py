@@ -198,7 +198,7 @@ class EdgeMax(torch.autograd.Function):
         k, out_width = index.shape[2], weight.shape[0]
         a, b, weight = a.contiguous(), b.contiguous(), weight.contiguous()
         ready = packed(library, weight, "edge_max")
-        out = torch.empty(batch, rows, out_width)
+        out = torch.empty(batch, rows, out_width, dtype=torch.float32)
         arg = torch.empty(batch, rows, out_width, dtype=torch.uint8) if want_grad else None
         for i in range(batch):
             library.straightpcf_edge_max(

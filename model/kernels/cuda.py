@@ -78,7 +78,7 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
 def farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:
     """Sample `wanted` farthest points of (N, 3) float32, beginning with row `first`: (wanted,) int64, one launch."""
     seeds = torch.empty(wanted, dtype=torch.int64, device=points.device)
-    apart = torch.full((len(points),), torch.inf, device=points.device)
+    apart = torch.full((len(points),), torch.inf, dtype=torch.float32, device=points.device)
     _farthest[1,](points.T.contiguous(), apart, seeds, len(points), wanted, first, BLOCK=_FARTHEST_BLOCK, num_warps=16)
     return seeds
 

@@ -48,7 +48,7 @@ class Fused:
         batch, count, _ = x.shape
         rows = count if rows is None else rows
         x = x.contiguous()
-        out = torch.empty((batch, self.out_width) if self._pool else (batch, rows, self.out_width))
+        out = torch.empty((batch, self.out_width) if self._pool else (batch, rows, self.out_width), dtype=torch.float32)
         for patch, to in zip(x, out, strict=True):
             self._library.straightpcf_fused(
                 ctypes.c_void_p(patch.data_ptr()), count, rows, self._neighbours, self._layers, self._widths,
