@@ -265,9 +265,11 @@ def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.
         label = extra.name
         while label in found or label in tuple("xyzXYZ"):
             label = f"extra_{label}"
-        values = rows[:, at : at + extra.width] if extra.width > 1 else _column(rows, at, extra.dtype)
-        found[label] = values if extra.is_plain else _scaled(values, extra)
-        at += extra.dtype.itemsize * extra.width
+        end = at + extra.dtype.itemsize * extra.width
+        values = rows[:, at:end].view(extra.dtype)
+        values = values if extra.is_plain else _scaled(values, extra)
+        found[label] = values if extra.width > 1 else values[:, 0]
+        at = end
     if at < header.row_bytes:
         found["extra_bytes"] = rows[:, at:]
     return found
@@ -276,7 +278,7 @@ def dimensions(rows: npt.NDArray[np.uint8], header: LasHeader) -> dict[str, npt.
 def value_bytes(header: LasHeader) -> int:
     """Return the bytes of a point once `dimensions` has read it: those of extra bytes with a scale become float64."""
     extra = _extra_dimensions(header, standard_bytes(header.point_format))
-    return header.row_bytes + sum(8 for dimension in extra if not dimension.is_plain)
+    return header.row_bytes + sum(8 * dimension.width for dimension in extra if not dimension.is_plain)
 
 
 def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
@@ -286,22 +288,26 @@ def _column(rows: npt.NDArray[np.uint8], at: int, dtype: np.dtype[Any]) -> npt.N
 
 @dataclass(frozen=True)
 class _Extra:
-    """Describe a dimension of extra bytes; width: of bytes that have no type.  Its value is scale * stored + offset."""
+    """Describe a dimension of extra bytes; width: of bytes that have no type, or values.
+
+    A value is scale * stored + offset, each of which there is one of, or one a value.
+    """
 
     name: str
     dtype: np.dtype[Any]
     width: int
-    scale: float
-    offset: float
+    scale: tuple[float, ...]
+    offset: tuple[float, ...]
 
     @property
     def is_plain(self) -> bool:
-        return self.scale == 1 and self.offset == 0
+        return set(self.scale) == {1} and set(self.offset) == {0}
 
 
 def _scaled(values: npt.NDArray[Any], extra: _Extra) -> npt.NDArray[np.float64]:
     with np.errstate(over="ignore", invalid="ignore"):  # floats with a scale may be anything
-        return values.astype(np.float64) * extra.scale + extra.offset
+        scaled: npt.NDArray[np.float64] = values.astype(np.float64) * extra.scale + extra.offset
+    return scaled
 
 
 def _extra_dimensions(header: LasHeader, at: int) -> list[_Extra]:
@@ -312,14 +318,19 @@ def _extra_dimensions(header: LasHeader, at: int) -> list[_Extra]:
     for begin in range(0, len(data) - _EXTRA_STRUCT_BYTES + 1, _EXTRA_STRUCT_BYTES):
         kind, options = data[begin + 2], data[begin + 3]
         name = data[begin + 4 : begin + 36].split(b"\0")[0].decode("utf-8", "replace") or f"extra_{len(found)}"
-        if kind > len(_EXTRA_TYPES) or (kind == 0 and options == 0):
-            break  # the deprecated pairs and triples: left as unnamed extra bytes
-        dtype, width = (np.dtype("<" + _EXTRA_TYPES[kind - 1]), 1) if kind else (np.dtype("u1"), options)
+        if kind > 3 * len(_EXTRA_TYPES) or (kind == 0 and options == 0):
+            break  # left as unnamed extra bytes
+        if kind:  # from 11 on pairs, from 21 on triples: of LAS 1.4 before R14, and of laspy still
+            width, code = (kind - 1) // len(_EXTRA_TYPES) + 1, _EXTRA_TYPES[(kind - 1) % len(_EXTRA_TYPES)]
+            dtype, values = np.dtype("<" + code), width
+        else:
+            dtype, width, values = np.dtype("u1"), options, 1
         at += dtype.itemsize * width
         if at > header.row_bytes:
             break
-        scale = struct.unpack_from("<d", data, begin + 112)[0] if kind and options & _HAS_SCALE else 1.0
-        offset = struct.unpack_from("<d", data, begin + 136)[0] if kind and options & _HAS_OFFSET else 0.0
-        is_usable = math.isfinite(scale) and math.isfinite(offset) and scale != 0
-        found.append(_Extra(name, dtype, width, *((scale, offset) if is_usable else (1.0, 0.0))))
+        ones, zeros, numbers = (1.0,) * values, (0.0,) * values, f"<{values}d"
+        scale = struct.unpack_from(numbers, data, begin + 112) if kind and options & _HAS_SCALE else ones
+        offset = struct.unpack_from(numbers, data, begin + 136) if kind and options & _HAS_OFFSET else zeros
+        is_usable = all(map(math.isfinite, (*scale, *offset))) and 0 not in scale
+        found.append(_Extra(name, dtype, width, *((scale, offset) if is_usable else (ones, zeros))))
     return found

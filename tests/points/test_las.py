@@ -304,6 +304,23 @@ def test_extra_bytes_are_read_with_their_scale_and_offset_and_kept_as_they_are(t
     np.testing.assert_allclose(read_cloud(tmp_path / "a.ply")[0].attributes["Amplitude"], np.arange(N) * 0.25)
 
 
+def test_extra_bytes_of_two_and_three_values_are_read_and_what_stands_behind_them_too(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=0)
+    header.add_extra_dim(laspy.ExtraBytesParams("normal", "3f4"))
+    header.add_extra_dim(laspy.ExtraBytesParams("uv", "2u2", scales=np.array([0.5, 2]), offsets=np.array([1.0, 0])))
+    header.add_extra_dim(laspy.ExtraBytesParams("quality", "f4"))
+    theirs = laspy.LasData(header)
+    theirs.xyz = torus(N)
+    theirs["normal"], theirs["quality"] = torus(N).astype("f4"), np.arange(N)
+    theirs.points.array["uv"] = np.arange(N)[:, None]
+    theirs.write(tmp_path / "a.las")
+    cloud, _ = read_cloud(tmp_path / "a.las")
+    np.testing.assert_array_equal(cloud.attributes["normal"], torus(N).astype("f4"))
+    np.testing.assert_array_equal(cloud.attributes["uv"], np.arange(N)[:, None] * [0.5, 2] + [1, 0])
+    np.testing.assert_array_equal(cloud.attributes["quality"], np.arange(N))
+    assert "extra_bytes" not in cloud.attributes
+
+
 WGS84 = b'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["degree",0.0174532925199433]]'
 UTM = b'PROJCS["WGS 84 / UTM zone 32N",' + WGS84 + b',PROJECTION["Transverse_Mercator"],UNIT["metre",1]]'
 SYSTEMS = {
