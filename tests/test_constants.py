@@ -25,6 +25,7 @@ NOT_TUNED = {
     "agreement.py": {"_LEAST_DISTANCE", "_STEPS"},
     "allocator.py": {"_M_TRIM_THRESHOLD", "_M_TOP_PAD", "_M_MMAP_THRESHOLD", "_LARGEST_THRESHOLD", "_KEPT", "_PAD"},
     "checkpoint.py": {"MAX_COUPLINGS", "MAX_WIDTH", "MAX_OFFICIAL_BYTES"},
+    "cpus.py": {"_IMPORTED_IN"},  # a process
     "device_patches.py": {"_DISTANCES"},
     "distinct.py": {"_GOLDEN"},
     "low_noise.py": {"_FIT_TERMS", "_RIDGE"},  # a quadric's six
