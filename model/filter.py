@@ -87,7 +87,10 @@ def denoise(
 
 
 class Filter:
-    """A loaded network with the stages around it; safe to use again, from one thread at a time."""
+    """A loaded network with the stages around it; safe to use again, from one thread at a time.
+
+    On a CPU it can be handed to other processes, also as what `multiprocessing.Pool.map` is to call.
+    """
 
     def __init__(
         self,

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -29,10 +29,12 @@ class OnHost:
 
     def __init__(self, network: Network, threads: int) -> None:
         self._network, self._threads = network, threads
-        self._make_pool()
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
 
-    def _make_pool(self) -> None:
-        self._pool, self._process = ThreadPoolExecutor(self._threads, initializer=_one_thread), os.getpid()
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the threads behind where a filter is handed to another process, or copied."""
+        return {**self.__dict__, "_pool": None}
 
     def displacements(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
@@ -88,12 +90,11 @@ class OnHost:
 
     def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
         """Map in order, few results waiting."""
-        if self._process != os.getpid():  # a fork has none of its parent's threads
-            self._make_pool()
+        pool = self._own_pool()
         waiting: deque[Future[_T]] = deque()
         try:
             for item in items:
-                waiting.append(self._pool.submit(_inference, function, item))
+                waiting.append(pool.submit(_inference, function, item))
                 if len(waiting) >= 2 * self._threads:
                     yield waiting.popleft().result()
             while waiting:
@@ -101,6 +102,12 @@ class OnHost:
         finally:
             for future in waiting:
                 future.cancel()
+
+    def _own_pool(self) -> ThreadPoolExecutor:
+        """Return the threads of this process: a fork has none of its parent's."""
+        if self._pool is None or self._process != os.getpid():
+            self._pool, self._process = ThreadPoolExecutor(self._threads, initializer=_one_thread), os.getpid()
+        return self._pool
 
 
 def _cut_out(points: torch.Tensor, cut: Patches, scales: Floats, patch: int) -> torch.Tensor:

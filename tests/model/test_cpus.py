@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import os
+import pickle
 
 import numpy as np
 import pytest
@@ -86,3 +88,11 @@ def test_a_forked_process_denoises_as_its_parent_does() -> None:
     found, total = results.get()
     np.testing.assert_array_equal(found, expected)
     assert total == 1 << 18
+
+
+def test_a_filter_can_be_handed_to_another_process_or_copied() -> None:
+    """As `multiprocessing.Pool.map` does with what it is to call."""
+    filter, cloud = Filter(StraightPCF(width=16, distance_width=16), threads=1), noisy(torus(60), 0.01)
+    expected = filter.denoise(cloud, DenoiseOptions(iterations=1)).xyz
+    for again in (pickle.loads(pickle.dumps(filter)), copy.deepcopy(filter)):
+        np.testing.assert_array_equal(again.denoise(cloud, DenoiseOptions(iterations=1)).xyz, expected)
