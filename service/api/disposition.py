@@ -10,7 +10,8 @@ from python_multipart.multipart import parse_options_header
 __all__ = ["disposition", "disposition_name"]
 
 _PLAIN = re.compile(r"[\w.~-]+", re.ASCII)
-_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+# To the end where it is not closed: to look for the end anew from each of its quotes takes minutes.
+_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*+"?')
 _EXTENDED = re.compile(r";\s*filename\*\s*=\s*(UTF-8|ISO-8859-1)'[\w-]*'([\w!#$&+.^`|~%-]+)", re.ASCII | re.IGNORECASE)
 
 

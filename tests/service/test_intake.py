@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import io
+import time
 from pathlib import Path
 
 import httpx2
 import numpy as np
 import pytest
 
+from straightpcf.service.api.disposition import disposition_name
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 from tests.service.in_process import serving
@@ -197,3 +199,10 @@ def test_an_empty_file_is_refused_at_once(server: RunningServer, path: str, form
     assert httpx2.put(f"{server.url}/jobs/empty", headers={"Content-Length": "0"}).status_code == 422
     assert httpx2.get(f"{server.url}/jobs").json()["jobs"] == []
     assert not server.spooled_files()
+
+
+def test_a_name_whose_quotes_are_not_closed_is_read_in_one_go() -> None:
+    began = time.process_time()  # looked for from each quote anew, the end held the whole server up for a minute
+    assert disposition_name('attachment; filename="' + '\\"' * 20_000) is not None
+    assert time.process_time() - began < 2
+    assert disposition_name("""a; x="b; filename*=UTF-8''no"; filename*=UTF-8''yes""") == "yes"
