@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sqlite3
 from collections.abc import AsyncIterator, Mapping
 
 from starlette.responses import StreamingResponse
 
 from straightpcf.points.errors import InvalidRequest, NotFound, ServerBusy, StraightPCFError
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE, PatchReader
+from straightpcf.service.api.errors import busy
 from straightpcf.service.api.schemas import Job
 from straightpcf.service.engine import Engine
 
@@ -46,6 +48,8 @@ async def _events(engine: Engine, id: str, owner: str, root: str, after: int) ->
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n".encode()
     except (NotFound, ServerBusy):
         return  # deleted while we looked, or the server ends: without `completed`, so that a client comes again
+    except (OSError, sqlite3.Error) as fault:
+        _passing(fault)
 
 
 async def _kept_alive(events: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -85,6 +89,8 @@ async def _while_it_works(patches: AsyncIterator[bytes]) -> AsyncIterator[bytes]
             yield chunk
     except StraightPCFError:
         return  # without the end frame, by which a reader knows
+    except (OSError, sqlite3.Error) as fault:
+        _passing(fault)
 
 
 async def _as_lines(patches: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -104,6 +110,16 @@ async def _as_lines(patches: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
                     )  # fmt: skip
     except StraightPCFError as error:
         yield _line(error={"code": error.code, "detail": error.message})
+    except (OSError, sqlite3.Error) as fault:
+        passing = _passing(fault)
+        yield _line(error={"code": passing.code, "detail": passing.message})
+
+
+def _passing(fault: OSError | sqlite3.Error) -> ServerBusy:
+    """Return what to say where the data directory cannot be used for a while; raises what is no such trouble."""
+    if (passing := busy(fault)) is None:
+        raise fault
+    return passing
 
 
 def _line(**values: object) -> bytes:
