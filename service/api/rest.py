@@ -79,12 +79,12 @@ async def denoise(request: Request, owner: Owner) -> Response:
     seconds = longest if prefer.wait is None else min(prefer.wait, longest)
     try:
         record = await _wait_while_connected(engine, request, record, seconds)
-    except ClientDisconnect:
+    except ServerBusy:  # it shuts down: the job is done at its next start
+        record = await engine.get(record.id, owner=owner)
+    except Exception:  # nobody listens any more, or the data directory cannot be used
         if private:
             await engine.forget(record.id, owner=owner)
         raise
-    except ServerBusy:  # it shuts down: the job is done at its next start
-        record = await engine.get(record.id, owner=owner)
     applied = prefer.applied(finished=record.finished, longest=longest)
     if not record.finished:
         return job_response(request, record, 202, applied)

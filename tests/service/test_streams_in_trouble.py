@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 
@@ -42,3 +43,29 @@ def test_streams_end_without_a_traceback(tmp_path: Path, caplog: pytest.LogCaptu
     play(scenario)
     assert not [record for record in caplog.records if record.exc_info]
     assert caplog.text.count("a request is sent away") == 3
+
+
+def test_a_request_that_is_sent_away_leaves_no_job_behind(tmp_path: Path) -> None:
+    backend = ObedientBackend()
+    backend.go.set()
+
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, backend, shutdown_seconds=0.1) as (engine, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            asked = asyncio.create_task(http.post("/denoise?filename=a.xyz", content=CLOUD))
+            await until(lambda: backend.runs)
+            get = engine.get
+
+            async def fails_once(id: str, *, owner: str = "") -> None:
+                engine.get = get  # type: ignore[method-assign]
+                raise OSError(5, "Input/output error")
+
+            engine.get = fails_once  # type: ignore[assignment, method-assign]
+            engine._notify(backend.runs[0].id)
+            answer = await asked
+            assert (answer.status_code, answer.json()["detail"]) == (503, SAID)
+            assert (await engine.list())[0] == []
+
+    play(scenario)
