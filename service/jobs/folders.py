@@ -21,7 +21,8 @@ from straightpcf.service.jobs.full_disk import full_disk_as_spool_full
 __all__ = ["INPUT", "JobFolders", "digest_of"]
 
 INPUT = "input"
-_MODE = 0o700  # other users of the machine have no key either
+# Other users of the machine have no key either, and the folders around may have been there, and theirs to look into.
+_MODE, _FILE_MODE = 0o700, 0o600
 _ORPHAN_SECONDS = 3600.0  # an upload, folder or lock that nobody owns is given up after this
 # What is called otherwise is no server's: a data directory may be a folder that had a `jobs` of its own.
 _OURS = re.compile(r"[0-9a-f]{32}")  # folders and locks
@@ -39,6 +40,7 @@ class JobFolders:
             folder.mkdir(mode=_MODE, exist_ok=True)
         self._check_moves()
         self.server = uuid.uuid4().hex
+        self._lock_path(self.server).touch(mode=_FILE_MODE)
         self._lock: IO[bytes] = self._lock_path(self.server).open("wb")
         fcntl.flock(self._lock, fcntl.LOCK_EX)
 
@@ -83,7 +85,7 @@ class JobFolders:
     def adopt(self, upload: Path, name: str) -> None:
         """Make an upload the input of a job that is about to be committed, durably."""
         folder = self.path(name)
-        folder.mkdir()
+        folder.mkdir(mode=_MODE)
         with upload.open("rb") as file:
             os.fsync(file.fileno())
         upload.replace(folder / INPUT)

@@ -53,6 +53,7 @@ def keep_reserve(data_dir: Path) -> None:
     path = data_dir / RESERVE
     try:
         if not path.exists() or path.stat().st_size < RESERVE_BYTES:
+            path.touch(mode=0o600)
             path.write_bytes(os.urandom(RESERVE_BYTES))  # of zeros a file system may keep none
     except OSError:
         path.unlink(missing_ok=True)

@@ -81,6 +81,24 @@ def test_what_others_have_in_a_data_directory_stays_there(tmp_path: Path) -> Non
 
 
 @pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no second disk here")
+def test_nobody_else_may_read_what_a_server_makes_in_folders_that_were_there(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        record, _ = await submit(engine)
+        await engine.wait(record.id)
+        made = [tmp_path / "jobs" / record.folder, *(tmp_path / "servers").iterdir(), tmp_path / "reserve"]
+        assert [path.name for path in made if path.stat().st_mode & 0o077] == []
+
+    before = os.umask(0o022)
+    try:
+        for name in ("jobs", "incoming", "servers"):
+            (tmp_path / name).mkdir(mode=0o755)
+        play(tmp_path, scenario)
+    finally:
+        os.umask(before)
+
+
 def test_folders_on_two_disks_are_refused_at_the_start(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm") as other:
         (tmp_path / "jobs").symlink_to(other)
