@@ -135,7 +135,7 @@ class JobRunner:
                 continue
             for running, hold in zip(tended, holds, strict=True):
                 if hold != "held":
-                    await running.end(hold)
+                    running.begin_to_end(hold)  # waits for nothing: the leases of the others go on
 
     async def _compute(self, claim: Claim) -> FileReport:
         record = claim.record
@@ -240,10 +240,13 @@ class _Running:
         self.over: asyncio.Future[None] = task.get_loop().create_future()
         self.reason: Reason | None = None
 
-    async def end(self, reason: Reason) -> None:
+    def begin_to_end(self, reason: Reason) -> None:
         if self.reason is None and not self.task.done():
             self.reason = reason
             self.task.cancel()
+
+    async def end(self, reason: Reason) -> None:
+        self.begin_to_end(reason)
         await asyncio.wait([self.over])
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 import sqlite3
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -25,8 +27,8 @@ from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import runner
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import Claim
-from straightpcf.service.jobs.store import JobStore
-from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, submit, until
+from straightpcf.service.jobs.store import Hold, JobStore
+from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, running, submit, until
 from tests.service.fakes import CONTENT, ObedientBackend
 
 
@@ -329,3 +331,39 @@ def test_a_file_of_a_newer_schema_is_refused(tmp_path: Path) -> None:
         db.execute("PRAGMA user_version = 99")
     with pytest.raises(InvalidOptions, match="99"):
         JobStore(tmp_path / "jobs.sqlite3")
+
+
+def test_leases_are_renewed_while_the_end_of_another_job_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "HEARTBEAT_SECONDS", 0.01)
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(runner, "END_TRIES", 10_000)
+    renewed: list[str] = []
+    fail, extend = JobStore.fail, JobStore.extend
+
+    def counted(store: JobStore, held: Sequence[tuple[str, int]], seconds: float) -> list[Hold]:
+        renewed.extend(id for id, _ in held)
+        return extend(store, held, seconds)
+
+    async def scene() -> None:
+        backend = ObedientBackend()
+        backend.slots = 2
+        backend.go.set()
+        async with running(tmp_path, backend) as engine:
+            canceled, other = (await submit(engine))[0], (await submit(engine, b"1 1 1\n"))[0]
+            await until(lambda: len(backend.runs) == 2)
+            monkeypatch.setattr(JobStore, "fail", _cannot_write)
+            await engine._call(JobStore.request_cancel, canceled.id, expires_in=1.0)  # as another server does
+            await until(lambda: backend.canceled)
+            renewed.clear()
+            await until(lambda: renewed.count(other.id) > 3)
+            monkeypatch.setattr(JobStore, "fail", fail)
+            assert (await engine.wait(canceled.id)).state == "canceled"
+
+    monkeypatch.setattr(JobStore, "extend", counted)
+    asyncio.run(asyncio.wait_for(scene(), timeout=10))
+
+
+def _cannot_write(*_: object, **__: object) -> bool:
+    raise OSError(errno.EIO, "Input/output error")
