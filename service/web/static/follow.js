@@ -72,6 +72,7 @@ async function fromResult(job, cloud, hooks, signal) {
   }
   const file = await (await call(`jobs/${encodeURIComponent(job.id)}/result`, { signal })).blob();
   const { count, stride, xyz } = await readFile(file, filename);
+  signal.throwIfAborted();
   if (cloud?.count !== count) {
     cloud = new Cloud({ count, stride });
     hooks.onCloud(cloud, `Only the result is shown, coloured by height. ${thinning(cloud)}`);

@@ -123,6 +123,7 @@ async function send() {
 }
 
 async function follow(id, before, signal) {
+  signal.throwIfAborted(); // while its file was read: what is shown by now is another's
   hideResult();
   let note = before?.xyz ? "" : before?.fault ?? "";
   if (!before?.xyz) stage.show(null, note);

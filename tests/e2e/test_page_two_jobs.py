@@ -1,0 +1,52 @@
+"""The page when another job is shown before it is through with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tests.waiting import wait_for
+
+HOLD_ONE = """() => {
+  window.held = null;
+  const post = Worker.prototype.postMessage;
+  Worker.prototype.postMessage = function (...said) {
+    Worker.prototype.postMessage = post;
+    window.held = () => this.postMessage(...said);
+  };
+}"""
+
+
+def test_what_is_left_for_another_job_is_seen_no_more(page: Any, scan: Path, tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def show(at: int, until: str) -> None:
+        asked.clear()
+        page.locator("#jobs-list li").nth(at).get_by_text("Show").click()
+        wait_for(lambda: page.wait_for_timeout(20) or until in asked)
+
+    page.on("request", lambda request: asked.append(request.url.rpartition("/")[2]))
+    (other := tmp_path / "other.ply").write_bytes(scan.read_bytes())
+    page.select_option("#iterations", "1")
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    page.evaluate(HOLD_ONE)
+    page.set_input_files("#file", other)
+    page.click("#submit")  # the server has it before the page has read it
+    wait_for(lambda: page.wait_for_timeout(20) or page.locator("#jobs-list li").count() == 2)
+    show(1, until="events")
+    page.wait_for_selector("#cancel", state="hidden")
+    asked.clear()
+    with page.expect_request("**/jobs?*"):  # at the end of what was left
+        page.evaluate("held()")
+    assert "events" not in asked
+    page.evaluate(HOLD_ONE)
+    page.route("**/stream", lambda route: route.fulfill(status=410, body="{}"))  # so that the result is read
+    show(1, until="result")
+    wait_for(lambda: page.wait_for_timeout(20) or page.evaluate("held !== null"))
+    page.route("**/events", lambda route: None)
+    show(0, until="events")
+    page.evaluate("held()")
+    page.wait_for_timeout(50)
+    assert page.is_hidden("#report")
