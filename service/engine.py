@@ -318,16 +318,16 @@ class Engine:
 
     async def cancel(self, id: str, *, owner: str = "") -> JobRecord:
         """Cancel a job; returns when nothing of this server works on it. A finished job stays as it is."""
-        await self.get(id, owner=owner)
-        await self._call(JobStore.request_cancel, id, expires_in=self.limits.result_ttl_seconds)
-        await self._runner.cancel(id)
+        record = await self.get(id, owner=owner)
+        await self._call(JobStore.request_cancel, id, record.folder, expires_in=self.limits.result_ttl_seconds)
+        await self._runner.cancel(record.folder)
         self._notify(id)
         return await self.get(id, owner=owner)
 
     async def delete(self, id: str, *, owner: str = "") -> None:
         """Cancel a job if it is not finished, and remove its files and all that is known of it."""
         record = await self.cancel(id, owner=owner)
-        await self._call(JobStore.delete, id)
+        await self._call(JobStore.delete, record.folder)  # its id may be another's by now
         await asyncio.to_thread(self._folders.remove, record.folder)
         await asyncio.to_thread(keep_reserve, self._data_dir)
         self._notify(id)

@@ -61,9 +61,9 @@ class JobRunner:
         """Tell that there is a new job."""
         self._work.set()
 
-    async def cancel(self, id: str) -> None:
-        """Stop working on a job, if this server does."""
-        for running in [running for running in self._running if running.claim.record.id == id]:
+    async def cancel(self, folder: str) -> None:
+        """Stop working on the job of a folder, if this server does."""
+        for running in [running for running in self._running if running.claim.record.folder == folder]:
             await running.end("canceled")
 
     async def stop(self, patience: Callable[[], float]) -> None:

@@ -146,20 +146,20 @@ class JobStore:
             for row in self._db.execute(query, (id, after))
         ]
 
-    def request_cancel(self, id: str, *, expires_in: float) -> JobRecord:
-        """Cancel a queued job at once; mark one that is worked on, for its server to see."""
+    def request_cancel(self, id: str, folder: str, *, expires_in: float) -> None:
+        """Cancel a queued job at once; mark one that is worked on, for its server to see; NotFound if it is another."""
         with self._transaction():
-            row = self._row(id)
+            if (row := self._row(id))["folder"] != folder:
+                raise NotFound(f"there is no job {id[:64]!r} any more; another has its id")
             if row["state"] == "queued":
                 self._end(id, "canceled", error=_canceled(id), expires_in=expires_in)
             elif row["state"] in _WORKING:
                 self._db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (id,))
-            return self._record(self._row(id))
 
-    def delete(self, id: str) -> None:
-        """Remove a job and its events; the fence of whoever works on it is void from now on."""
+    def delete(self, folder: str) -> None:
+        """Remove a folder's job and its events; the fence of whoever works on it is void from now on."""
         with self._transaction():
-            self._db.execute("DELETE FROM jobs WHERE id = ?", (id,))
+            self._db.execute("DELETE FROM jobs WHERE folder = ?", (folder,))
 
     def load(self, owner: str | None = None) -> Load:
         """Sum up what waits and runs and what is kept, for one owner or for all."""

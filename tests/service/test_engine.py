@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from straightpcf.points.errors import (
 )
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.engine import CHUNK_BYTES, Engine
+from straightpcf.service.jobs.record import JobRecord
 from tests.service.engines import kinds, play, submit
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -250,3 +252,24 @@ def test_what_runs_has_one_limit_from_the_moment_that_a_server_drains(tmp_path: 
         assert engine.patience_seconds == 0
 
     play(tmp_path, scenario, shutdown_seconds=60.0)
+
+
+@pytest.mark.parametrize("swapped", ["get", "cancel"])
+def test_whoever_deletes_a_job_harms_no_other_that_has_its_id_by_then(tmp_path: Path, swapped: str) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        await submit(engine, owner="one", id="x")
+        look = getattr(engine, swapped)
+
+        async def late(id: str, *, owner: str = "") -> JobRecord:
+            setattr(engine, swapped, look)
+            record: JobRecord = await look(id, owner=owner)
+            await engine.delete(id, owner="one")  # asked for twice, and this one was quicker
+            await submit(engine, b"1 1 1\n", owner="another", id="x")
+            return record
+
+        setattr(engine, swapped, late)
+        with contextlib.suppress(NotFound):
+            await engine.delete("x", owner="one")
+        assert (await engine.get("x", owner="another")).state == "queued"
+
+    play(tmp_path, scenario)

@@ -187,8 +187,8 @@ def test_a_cancel_that_comes_between_a_claim_and_the_jobs_first_step_ends_it(
         record, _ = await submit(engine)
 
         async def cancel() -> None:  # as the engine does once it has found the job
-            await engine._call(JobStore.request_cancel, record.id, expires_in=60)
-            await engine._runner.cancel(record.id)
+            await engine._call(JobStore.request_cancel, record.id, record.folder, expires_in=60)
+            await engine._runner.cancel(record.folder)
 
         backend.go.set()
         await asyncio.sleep(0.02)  # the claim is under way
@@ -209,7 +209,7 @@ def test_a_canceled_job_is_not_started_again_when_its_worker_or_server_dies(tmp_
         backend.go.set()
         record, _ = await submit(engine)
         await until(lambda: backend.runs)
-        await engine._call(JobStore.request_cancel, record.id, expires_in=60)  # no heartbeat has seen it yet
+        await engine._call(JobStore.request_cancel, record.id, record.folder, expires_in=60)  # no heartbeat saw it
         backend.finish.set()
         assert (await engine.wait(record.id)).state == "canceled"
         assert len(backend.runs) == 1
@@ -219,7 +219,7 @@ def test_a_canceled_job_is_not_started_again_when_its_worker_or_server_dies(tmp_
         records = [(await submit(engine, content))[0] for content in (b"0", b"1")]
         for _ in records:
             await engine._call(JobStore.claim, "the dead", 15.0)
-        await engine._call(JobStore.request_cancel, records[0].id, expires_in=60)
+        await engine._call(JobStore.request_cancel, records[0].id, records[0].folder, expires_in=60)
         await engine._sweeper.sweep()
         assert [(await engine.get(record.id)).state for record in records] == ["canceled", "queued"]
 
@@ -354,7 +354,7 @@ def test_leases_are_renewed_while_the_end_of_another_job_cannot_be_written(
             canceled, other = (await submit(engine))[0], (await submit(engine, b"1 1 1\n"))[0]
             await until(lambda: len(backend.runs) == 2)
             monkeypatch.setattr(JobStore, "fail", _cannot_write)
-            await engine._call(JobStore.request_cancel, canceled.id, expires_in=1.0)  # as another server does
+            await engine._call(JobStore.request_cancel, canceled.id, canceled.folder, expires_in=1)  # as others do
             await until(lambda: backend.canceled)
             renewed.clear()
             await until(lambda: renewed.count(other.id) > 3)
