@@ -50,3 +50,21 @@ def test_what_is_left_for_another_job_is_seen_no_more(page: Any, scan: Path, tmp
     page.evaluate("held()")
     page.wait_for_timeout(50)
     assert page.is_hidden("#report")
+
+
+def test_a_list_that_comes_late_takes_no_newer_ones_place(page: Any, scan: Path) -> None:
+    held: list[Any] = []
+    page.select_option("#iterations", "1")
+    page.set_input_files("#file", scan)
+    page.click("#submit")
+    page.locator("#jobs-list li").get_by_text("Download").wait_for()
+    page.route("**/jobs?*", lambda route: held.append((route, route.fetch())), times=1)
+    page.click("#jobs-refresh")
+    wait_for(lambda: page.wait_for_timeout(20) or held)
+    page.locator("#jobs-list li").get_by_text("Delete").click()
+    page.wait_for_selector("#jobs", state="hidden")
+    route, answer = held[0]
+    with page.expect_response("**/jobs?*"):
+        route.fulfill(response=answer)
+    page.wait_for_timeout(50)
+    assert page.is_hidden("#jobs")

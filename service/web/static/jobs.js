@@ -14,6 +14,8 @@ const SAID = {
   expired: "expired: its files are gone",
 };
 
+let looks = 0; // at the list: an answer that comes behind that to a later one is old
+
 export function rememberJob(id) {
   keep(KEY, JSON.stringify([id, ...known().filter((other) => other !== id)].slice(0, MOST)));
 }
@@ -38,11 +40,13 @@ export async function forgetJob(id) {
 
 // Fill `list`, and show `section` if there is anything in it.
 export async function showJobs({ section, list, ...hooks }) {
+  const mine = ++looks;
   if (known().length === 0) {
     section.hidden = true;
     return;
   }
   const ours = await found();
+  if (mine !== looks) return;
   section.hidden = ours.length === 0;
   const again = () => showJobs({ section, list, ...hooks });
   const rows = ours.map((job, at) => row(job, { name: told(ours, at), again, ...hooks }));
