@@ -35,6 +35,7 @@ POLL_SECONDS = 1.0
 # Who still waits when a server ends is answered so long before what runs is cut off.
 FAREWELL_SECONDS = 1.5 * POLL_SECONDS
 CHUNK_BYTES = 2**20
+_TRACE = 64  # characters of a traceparent that are kept, of the 55 that it has: a header may have 64 KiB
 
 logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` shows
 
@@ -205,7 +206,7 @@ class Engine:
             ),
             digest=hashlib.sha256(json.dumps(said).encode()).hexdigest(),
             idempotency_key=request.idempotency_key,
-            traceparent=request.traceparent,
+            traceparent=request.traceparent and request.traceparent[:_TRACE],
         )
         record, created = await self._call(self._admit, new, source)
         if created:

@@ -273,3 +273,12 @@ def test_whoever_deletes_a_job_harms_no_other_that_has_its_id_by_then(tmp_path: 
         assert (await engine.get("x", owner="another")).state == "queued"
 
     play(tmp_path, scenario)
+
+
+def test_a_traceparent_of_any_length_takes_little_room(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        usual = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+        assert (await submit(engine, traceparent=usual))[0].traceparent == usual
+        assert (await submit(engine, traceparent="a" * 60_000))[0].traceparent == "a" * 64
+
+    play(tmp_path, scenario)
