@@ -119,3 +119,20 @@ def test_a_worker_that_cannot_be_replaced_at_this_moment_is_replaced_later(
     assert (workers.started, workers.faults, backend.restarts) == (2, [], 1)
     assert "Too many open files" in caplog.text
     assert "no process" in caplog.text
+
+
+def test_a_worker_that_cannot_be_put_away_at_this_moment_is_replaced_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults = [RuntimeError("can't start new thread")]  # of asyncio.to_thread, where a container has no more threads
+
+    async def stop(worker: Worker, *, patience_seconds: float) -> None:
+        if faults:
+            raise faults.pop()
+
+    monkeypatch.setattr(Worker, "stop", stop)
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
+    monkeypatch.setattr(local, "FIRST_RESTART_DELAY_SECONDS", 0.01)
+    run_over_a_death()
+    assert (workers.started, faults) == (2, [])
+    assert "can't start new thread" in caplog.text
