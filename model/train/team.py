@@ -22,6 +22,7 @@ from straightpcf.model.train.passed import training_patches
 __all__ = ["NetworkLoss", "Team"]
 
 NetworkLoss = Callable[[StraightPCF, Batch], torch.Tensor]
+_SECONDS_TO_END = 10.0
 _LEADERS_OWN = (signal.SIGINT, signal.SIGTERM)  # sent to the group; the process that updates the weights heeds them
 
 
@@ -64,23 +65,29 @@ class Team:
             self._members.append((ours, gradient))
 
     def start(self, *, training: bool) -> None:
-        """Set every member to work on its share; do your own meanwhile."""
+        """Set every member to work on its share; do your own meanwhile. Raises RuntimeError where one has ended."""
         self._iteration += 1
-        for pipe, _ in self._members:
-            pipe.send((training, self._iteration))
+        for number, (pipe, _) in enumerate(self._members):
+            try:
+                pipe.send((training, self._iteration))
+            except OSError:
+                raise self._ended(number) from None
 
     def join(self, loss: torch.Tensor) -> torch.Tensor:
-        """Average the gradients that the parameters have with those of all members, and the loss with theirs."""
+        """Average the gradients that the parameters have with those of all members, and the loss with theirs.
+
+        Raises RuntimeError where a member has ended.
+        """
         share = 1 / (1 + len(self._members))
         for parameter in self._parameters:
             if parameter.grad is not None:
                 parameter.grad.mul_(share)
         loss = loss * share
-        for pipe, gradient in self._members:
+        for number, (pipe, gradient) in enumerate(self._members):
             try:
                 loss = loss + share * pipe.recv()
-            except EOFError:
-                raise RuntimeError("a process that shared the batch has ended; its error is above") from None
+            except (EOFError, OSError):  # the latter where it ended before it had read what it was to do
+                raise self._ended(number) from None
             at = 0
             for parameter in self._parameters:
                 if parameter.grad is not None:
@@ -96,6 +103,14 @@ class Team:
         for process in self._processes:
             process.kill()
             process.join()
+
+    def _ended(self, number: int) -> RuntimeError:
+        """Say how a member ended: as an error of its pipe it would pass for one of a file, or of stdout's reader."""
+        process = self._processes[number]
+        process.join(_SECONDS_TO_END)
+        signalled = process.exitcode is not None and process.exitcode < 0  # as by the system, where memory runs out
+        how = f"by signal {-(process.exitcode or 0)}" if signalled else "its error is above"
+        return RuntimeError(f"a process that shared the batch has ended, {how}; the last state that was saved is kept")
 
     def __enter__(self) -> Self:
         return self
