@@ -345,7 +345,9 @@ def drawn_noise(
     if eye is None or rng.random() >= ALONG_BEAMS:
         return noise
     beams = clean - eye
-    along: npt.NDArray[np.float64] = noise[:, :1] * beams / np.linalg.norm(beams, axis=1, keepdims=True)
+    length = np.linalg.norm(beams, axis=1, keepdims=True)
+    # A scan's "nothing was met" often lies in the eye itself, and has no beam.
+    along: npt.NDArray[np.float64] = noise[:, :1] * beams / np.where(length > 0, length, 1.0)
     return along
 
 

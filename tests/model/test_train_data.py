@@ -12,7 +12,16 @@ import torch
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import LARGEST_RADIUS
 from straightpcf.model.patches import PATCH_SIZE
-from straightpcf.model.train.data import EARLIEST, NOISE_STD, ONE_WAY, SCALES, Batch, PatchSource
+from straightpcf.model.train.data import (
+    ALONG_BEAMS,
+    EARLIEST,
+    NOISE_STD,
+    ONE_WAY,
+    SCALES,
+    Batch,
+    PatchSource,
+    drawn_noise,
+)
 from straightpcf.model.train.device_data import DevicePatchSource, random_rotations
 from straightpcf.model.train.losses import coupled_loss, distance_loss, precision
 from straightpcf.model.turns import turns
@@ -261,6 +270,17 @@ def test_an_archive_that_cannot_be_trained_on_is_refused_by_file_and_name(case: 
     np.savez(path := tmp_path / "shapes.npz", **arrays)
     with pytest.raises(error, match=f"shapes.npz.*{message}"):
         PatchSource.read(path)
+
+
+def test_a_point_where_the_beams_came_from_has_no_noise_along_them() -> None:
+    # Scanners write "nothing was met" so, and a draw that was not finite ended a run after hours.
+    clean = np.concatenate([sphere(9), np.zeros((1, 3))])
+    rng = np.random.default_rng(0)
+    noises = [drawn_noise(rng, clean, np.zeros(3)) for _ in range(20)]
+    assert np.isfinite(noises).all()
+    along = [noise for noise in noises if not noise[-1].any()]
+    assert len(along) == pytest.approx(20 * ALONG_BEAMS, abs=5)
+    np.testing.assert_allclose(np.cross(along[0], clean), 0, atol=1e-12)
 
 
 def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
