@@ -19,7 +19,8 @@ __all__ = ["by_stem", "opened", "read_array", "split_name", "write_archive"]
 
 _ROWS = {"eye": (3,), "frame": (4,)}  # the shapes of what is no cloud
 _MOST_EXTENT = 1e18  # its square is a float32
-_BESIDE = ("eye", "frame", "normals", "surface")
+_NO_CLOUDS = ("eye", "frame", "normals")
+_LENGTH_SLACK = 0.01  # normals come from files of few digits, too
 
 
 @contextmanager
@@ -46,7 +47,7 @@ def split_name(name: str, path: Path, *, rule: str = "<shape>/<resolution>") -> 
 
 
 def read_array(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> npt.NDArray[np.float32]:
-    """Read a cloud or what stands beside one; all numbers are finite."""
+    """Read a cloud or what stands beside one; all numbers are finite, and normals are as long as they should be."""
     values, what = archive[name], name.rpartition("/")[2]
     is_array = isinstance(values, np.ndarray) and values.dtype.kind == "f"  # of another member, bytes
     shape = values.shape if is_array else ()
@@ -56,11 +57,19 @@ def read_array(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> npt.NDAr
         raise MalformedFile(f"{path}: {name[:80]} is {found}; it must be {wanted} floats")
     if not np.isfinite(values).all():
         raise MalformedFile(f"{path}: {name[:80]} holds NaN or infinity")
-    if what not in _BESIDE and len(values) < PATCH_SIZE:
+    if what == "normals" and len(wrong := _not_unit(values)):
+        raise MalformedFile(f"{path}: {name[:80]} has {len(wrong)} of a length like {wrong[0]:g}; it must be 1")
+    if what not in _NO_CLOUDS and len(values) < PATCH_SIZE:
         raise TooFewPoints(f"{path}: {name[:80]} has {len(values)} points; a training patch has {PATCH_SIZE}")
-    if what not in _BESIDE and not 0 < (extent := float(np.ptp(values, axis=0).max())) < _MOST_EXTENT:
+    if what not in _NO_CLOUDS and not 0 < (extent := float(np.ptp(values, axis=0).max())) < _MOST_EXTENT:
         raise MalformedFile(f"{path}: {name[:80]} is {extent:g} wide; it must be above 0 and below {_MOST_EXTENT:g}")
     return values
+
+
+def _not_unit(normals: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Return the lengths that are not 1, of normals (N, 3)."""
+    lengths = np.linalg.norm(normals.astype(np.float64), axis=1)
+    return lengths[np.abs(lengths - 1) > _LENGTH_SLACK]
 
 
 def by_stem(paths: Sequence[Path]) -> dict[str, Path]:

@@ -255,6 +255,21 @@ ARCHIVES: dict[str, tuple[dict[str, Any], type[InvalidCloud], str]] = {
     "one place": ({"a/1": np.ones((PATCH_SIZE, 3))}, MalformedFile, "a/1 is 0 wide"),
     "no float32": ({"a/1": 1e200 * sphere(PATCH_SIZE)}, MalformedFile, r"a/1 is .*e\+200 wide"),
     "objects": ({"a/1": np.array([None] * 3)}, MalformedFile, "cannot be read as NPZ"),
+    "a surface of a point": (
+        {"a/1": sphere(PATCH_SIZE), "a/surface": sphere(1)},
+        TooFewPoints,
+        "a/surface has 1 points",
+    ),
+    "a surface in one place": (
+        {"a/1": sphere(PATCH_SIZE), "a/surface": np.ones((PATCH_SIZE, 3))},
+        MalformedFile,
+        "a/surface is 0 wide",
+    ),
+    "long normals": (
+        {"a/1": sphere(PATCH_SIZE), "a/normals": 2 * sphere(PATCH_SIZE)},
+        MalformedFile,
+        "a/normals has 1000 of a length like 2; it must be 1",
+    ),
     "a place of beams": ({"a/eye": np.zeros((2, 3))}, MalformedFile, r"a/eye is float64 \(2, 3\); it must be \(3,\)"),
     "normals of others": (
         {"a/1": sphere(PATCH_SIZE), "a/normals": sphere(7)},
