@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, file_to_write, noise_level, positive
+from benchmarks.command import errors_in_one_line, file_to_write, noise_level, positive, share_of_two
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
 from straightpcf.model.calibration import Calibration
@@ -30,6 +30,9 @@ from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.archive import opened
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
+from straightpcf.points.errors import MalformedFile
+
+_Key = tuple[str, str, float]  # of a trace: its cloud, type and size of noise
 
 # The table is read of every fifth shape's 50K points: with 3 % of noise d is lower there than at 10K, and noise read
 # too low costs more than noise read too high (docs/filter.md).
@@ -45,14 +48,14 @@ def main() -> None:
     parser.add_argument(
         "--mean", type=Path, help="a state trained on from this one: take the mean of both's velocities"
     )
-    parser.add_argument("--share", type=float, default=0.5, help="of the state in that mean, 0..1")
+    parser.add_argument("--share", type=share_of_two, help="of the state in that mean, 0..1, 0.5 by default")
     parser.add_argument("--table", type=Path, help="weights whose table of noise to keep, instead of reading a new one")
     parser.add_argument("--keep", type=Path, help="weights whose DistanceModule and calibration to keep as they are")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
         "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
     )
-    parser.add_argument("--traces", type=Path, help="keep what was measured here, and use what is there")
+    parser.add_argument("--traces", type=file_to_write, help="keep what was measured here, and use what is there")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=NOISE_LEVELS)
     parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
     parser.add_argument("--threads", type=positive, default=None)
@@ -61,10 +64,15 @@ def main() -> None:
     if arguments.keep is not None and (arguments.distance or arguments.table or arguments.traces):
         parser.error("--keep takes all from one file and measures nothing: no --distance, --table or --traces with it")
 
+    if arguments.share is not None and arguments.mean is None:
+        parser.error("--share is of a mean: give --mean with it")
+
+    known = _recorded(arguments.traces)
     network, progress = read_network(arguments.state)
     if arguments.mean is not None:
-        progress["mean_with"] = average_with(network, arguments.mean, arguments.share)
-        progress["share"] = arguments.share
+        share = 0.5 if arguments.share is None else arguments.share
+        progress["mean_with"] = average_with(network, arguments.mean, share)
+        progress["share"] = share
     if arguments.keep is not None:
         take_distance_module(network, arguments.keep)
         _write(network, progress, Calibration.from_metadata(read_checkpoint(arguments.keep)[1]), arguments.out)
@@ -81,7 +89,7 @@ def main() -> None:
         model.calibration = noise_table(model, dense)
     else:
         model.calibration = Calibration.from_metadata(read_checkpoint(arguments.table)[1])
-    traces = _traces(model, clouds, arguments.noise_type, arguments.noise, arguments.traces)
+    traces = _traces(model, clouds, arguments.noise_type, arguments.noise, known, arguments.traces)
     calibration = calibrate(traces, model.calibration)
     columns = f"{'d before each pass':32} {'CD x1e4 after 0, 1, ...':42}"
     print(f"{'cloud':18} {'noise':>16}  {columns} auto best")
@@ -112,11 +120,22 @@ def _read(archive: Mapping[str, npt.NDArray[np.float32]], names: list[str]) -> d
     return {name: CloudFrame.of(xyz).enter(xyz) for name, xyz in clouds.items()}
 
 
+def _recorded(kept: Path | None) -> dict[_Key, Trace]:
+    """Return the traces that are there; raises MalformedFile, before the work, for what is none."""
+    found = {}
+    for number, line in enumerate(kept.read_text().splitlines() if kept is not None and kept.is_file() else [], 1):
+        try:
+            known = Trace(**json.loads(line))
+        except (ValueError, TypeError) as exc:
+            raise MalformedFile(f"{kept}: line {number} is no trace: {exc}") from exc
+        found[known.cloud, known.noise_type, known.noise_std] = known
+    return found
+
+
 def _traces(
-    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], kind: str, noise: list[float], kept: Path | None
-) -> list[Trace]:
-    lines = kept.read_text().splitlines() if kept is not None and kept.is_file() else []
-    known = {(t.cloud, t.noise_type, t.noise_std): t for t in (Trace(**json.loads(line)) for line in lines)}
+    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], kind: str, noise: list[float],
+    known: dict[_Key, Trace], kept: Path | None,
+) -> list[Trace]:  # fmt: skip
     for name, clean in clouds.items():
         for std in noise:
             if (name, kind, std) in known:

@@ -9,7 +9,7 @@ from straightpcf.model.filter import device_named
 from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
 from straightpcf.points.errors import DeviceUnavailable
 
-__all__ = ["device", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
+__all__ = ["device", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number", "share_of_two"]
 
 
 def device(text: str) -> str:
@@ -25,4 +25,12 @@ def noise_level(text: str) -> float:
     value = float(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is no level of noise, which is 0 or more")
+    return value
+
+
+def share_of_two(text: str) -> float:
+    """Read the share of one of two, for argparse: a mean of weights with NaN would be written as weights."""
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is no share, which is 0 to 1")
     return value

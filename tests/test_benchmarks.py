@@ -163,6 +163,26 @@ def test_weights_of_a_state_keep_what_ships_beside_their_velocities(tmp_path: Pa
     assert says["training"]["mean_with"] == about["training"]
 
 
+@pytest.mark.parametrize("share", ["nan", "1.5", "-0.1"])
+def test_a_share_that_makes_no_mean_is_a_usage_error(refused: Refused, share: str) -> None:
+    # NaN made weights of NaN, which --out put in the place of those that ship.
+    options = ("--state", DEFAULT_WEIGHTS, "--keep", DEFAULT_WEIGHTS)
+    code, said = refused("calibrate", *options, "--mean", DEFAULT_WEIGHTS, f"--share={share}")
+    assert code == 2
+    assert f"{share} is no share, which is 0 to 1" in said.splitlines()[-1]
+    code, said = refused("calibrate", *options, "--share", 0.75)
+    assert (code, said.splitlines()[-1]) == (2, f"{said.split()[1]}: error: --share is of a mean: give --mean with it")
+
+
+def test_what_is_no_trace_is_named_by_its_line_before_the_work(refused: Refused, tmp_path: Path) -> None:
+    trace = json.dumps({"cloud": "a/1000", "noise_std": 0.01, "distances": [0.5], "chamfer": [1e-4]})
+    for broken in (trace[:20], "{}", "[1]"):  # the first as a full disk leaves it
+        (traces := tmp_path / "traces.jsonl").write_text(f"{trace}\n{broken}\n")
+        code, said = refused("calibrate", "--state", DEFAULT_WEIGHTS, "--traces", traces)
+        assert code == 1
+        assert f"{traces}: line 2 is no trace" in said
+
+
 @pytest.mark.parametrize("points", [("--resolution", 1000), ("--random", "--resolution", 700)])
 def test_candidates_are_compared_on_what_is_held_out(points: tuple[object, ...], tmp_path: Path) -> None:
     clouds = {f"{name}/1000": sphere(1000) for name in "abcdefghijkl"}
@@ -229,7 +249,10 @@ def test_a_count_of_nothing_is_a_usage_error(refused: Refused, arguments: str) -
     assert "0 is no whole number of 1 or more" in said.splitlines()[-1]
 
 
-@pytest.mark.parametrize("arguments", ["calibrate --state none --out", "scenes --json", "scaling --plot"])
+@pytest.mark.parametrize(
+    "arguments",
+    ["calibrate --state none --out", "calibrate --state none --traces", "scenes --json", "scaling --plot"],
+)
 def test_what_cannot_be_written_is_said_before_it_is_made(refused: Refused, arguments: str, tmp_path: Path) -> None:
     code, said = refused(*arguments.split(), tmp_path / "gone" / "figures")
     assert code == 2
