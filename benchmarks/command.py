@@ -9,7 +9,24 @@ from straightpcf.model.filter import device_named
 from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
 from straightpcf.points.errors import DeviceUnavailable
 
-__all__ = ["device", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number", "share_of_two"]
+__all__ = [
+    "coverage",
+    "device",
+    "errors_in_one_line",
+    "file_to_write",
+    "noise_level",
+    "positive",
+    "seed_number",
+    "share_of_two",
+]
+
+
+def coverage(text: str) -> float:
+    """Read how many patches a point is to have, for argparse, within what the filter takes."""
+    value = float(text)
+    if not 1 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no coverage, which is 1 or more")
+    return value
 
 
 def device(text: str) -> str:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from benchmarks.command import device, errors_in_one_line, noise_level, positive, seed_number
+from benchmarks.command import coverage, device, errors_in_one_line, noise_level, positive, seed_number
 from benchmarks.conventional import jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
@@ -77,6 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
     run = _runner(options)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.open("a").close()  # what cannot be written is found out before the work
     rows = []
     for resolution in options.resolution:
         for noise in options.noise:
@@ -246,7 +247,7 @@ def _parser() -> argparse.ArgumentParser:
         help='"auto" beside every fixed number of passes, which it is cut from: seconds are those of all of them',
     )
     parser.add_argument("--euler-steps", type=positive, help="N of the paper, 3 by default")
-    parser.add_argument("--coverage", type=float, help="patches a point, 3 by default; the published scheme takes 6")
+    parser.add_argument("--coverage", type=coverage, help="patches a point, 3 by default; the published scheme takes 6")
     parser.add_argument("--every-evaluation", action="store_true", help="evaluate every point of a patch every time")
     parser.add_argument("--without-distance", action="store_true", help="d = 1, as in the paper's ablation")
     parser.add_argument("--shapes", nargs="+", help="only these")

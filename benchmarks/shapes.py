@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.metrics import unit_sphere
+from straightpcf.model.run import MIN_POINTS
 from straightpcf.model.train.archive import opened
+from straightpcf.points.errors import InvalidOptions
 
 __all__ = ["ANALYTIC", "NOISE_TYPES", "Shape", "analytic", "make_noise", "punet"]
 
@@ -52,7 +54,12 @@ def punet(data: Path, resolution: int, names: list[str] | None = None) -> list[S
 
 
 def analytic(resolution: int, names: list[str] | None = None) -> list[Shape]:
-    """Sample the shapes of ANALYTIC, all or those named, evenly with a fixed seed."""
+    """Sample the shapes of ANALYTIC, all or those named, evenly with a fixed seed.
+
+    Raises InvalidOptions for fewer points than can be filtered.
+    """
+    if resolution < MIN_POINTS:
+        raise InvalidOptions(f"{resolution} points; at least {MIN_POINTS} can be filtered")
     if unknown := set(names or ()) - set(ANALYTIC):
         raise SystemExit(f"no shape {', '.join(sorted(unknown))}; known: {', '.join(ANALYTIC)}")
     made = []

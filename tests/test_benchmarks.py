@@ -259,6 +259,23 @@ def test_what_cannot_be_written_is_said_before_it_is_made(refused: Refused, argu
     assert "is no folder to write figures to" in said.splitlines()[-1]
 
 
+def test_figures_that_have_no_place_are_refused_before_they_are_made(refused: Refused, tmp_path: Path) -> None:
+    options = ("--split", "validation", "--shapes", "sphere", "--resolution", 500, "--model", "noisy")
+    assert refused("quality", *options, "--json", tmp_path) == (1, f"[Errno 21] Is a directory: '{tmp_path}'")
+
+
+@pytest.mark.parametrize("coverage", ["0", "0.5", "nan", "inf"])
+def test_a_coverage_that_the_filter_does_not_take_is_a_usage_error(refused: Refused, coverage: str) -> None:
+    code, said = refused("quality", "--split", "validation", "--coverage", coverage)
+    assert code == 2
+    assert f"{coverage} is no coverage, which is 1 or more" in said.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", ["quality --split validation --model noisy", "conditions cut"])
+def test_an_analytic_shape_of_fewer_points_than_can_be_filtered_is_refused(refused: Refused, name: str) -> None:
+    assert refused(*name.split(), "--resolution", 20) == (1, "20 points; at least 33 can be filtered")
+
+
 def test_a_cloud_too_small_to_filter_is_a_usage_error(refused: Refused) -> None:
     code, said = refused("scaling", "--points", 1000, 32)
     assert code == 2
