@@ -57,7 +57,11 @@ def main() -> None:
     parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
     options = DenoiseOptions.parse(iterations=arguments.iterations)
-    truths = dict(_truths(arguments))
+    truths: dict[str, Truth] = {}
+    for shape, truth in _truths(arguments):
+        if shape in truths:
+            raise InvalidOptions(f"two of the archives have a shape {shape}, by which figures are named")
+        truths[shape] = truth
     if not truths:
         parser.error("no shape of these names is held out")
     candidates = {path: _filter(path, arguments.threads) for path in arguments.candidates}

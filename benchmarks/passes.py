@@ -101,11 +101,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
+    networks = [(state, read_network(state)[0]) for state in arguments.states]  # one that is none is found out first
     with opened(arguments.data) as archive:
         truths = [Truth.read(archive, shape, _RESOLUTION) for shape in sorted(held_out_shapes(archive.files))]
     print(f"{'velocities':40} noise  pass     CD  across   sunk")
-    for state in arguments.states:
-        network, _ = read_network(state)
+    for state, network in networks:
         if arguments.distance is not None:
             take_distance_module(network, arguments.distance)
         if len(network.velocity_modules) == 1:  # as a stack of copies

@@ -51,6 +51,12 @@ def errors(modules: Iterable[nn.Module], batch: Batch) -> torch.Tensor:
     return torch.stack(found, dim=1)
 
 
+def _modules(name: str, data: Path) -> list[nn.Module]:
+    if name == "official":
+        return [load_official_checkpoint(data / "official" / "ckpt_vm.pt")]
+    return list(read_network(Path(name))[0].velocity_modules)
+
+
 def _normals(clean: torch.Tensor) -> torch.Tensor:
     index = torch.cdist(clean, clean).topk(_NEIGHBOURS, largest=False).indices
     around = torch.stack([patch[rows] for patch, rows in zip(clean, index, strict=True)])
@@ -69,17 +75,13 @@ def main() -> None:
     parser.add_argument("--threads", type=positive, default=1)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
+    stacks = {name: _modules(name, arguments.data) for name in arguments.states}  # one that is none is found out first
     source = PatchSource.read(arguments.data / "punet_train.npz", validation=True)
     batch = source.draw(np.random.default_rng(1), arguments.patches)
     parts = batch.split(-(-arguments.patches // _AT_ONCE))
     quarter = (4 * batch.time.flatten()).floor().long()  # t < 0, before the first, counts in the means
     print(f"{'velocities':44} {'across, of each module (in quarters of t)':58} along   end, across")
-    for name in arguments.states:
-        modules: list[nn.Module]
-        if name == "official":
-            modules = [load_official_checkpoint(arguments.data / "official" / "ckpt_vm.pt")]
-        else:
-            modules = list(read_network(Path(name))[0].velocity_modules)
+    for name, modules in stacks.items():
         for stack in [modules, modules * 2] if len(modules) == 1 else [modules]:
             for module in stack:
                 module.eval()

@@ -213,6 +213,25 @@ def test_points_that_an_archive_lacks_are_named_in_one_line(tmp_path: Path) -> N
         assert f"f/{points[-1]}" in line
 
 
+def test_two_archives_with_a_shape_of_one_name_are_refused(refused: Refused, tmp_path: Path) -> None:
+    # Of the two one was measured, and the other left out without a word.
+    clouds = {f"{name}/{count}": sphere(200) for name in "abcdef" for count in (1000, 50_000)}
+    for archive in ("trained", "unseen"):
+        np.savez(tmp_path / f"{archive}.npz", **clouds)  # type: ignore[arg-type]
+    trained, unseen = ("--data", tmp_path / "trained.npz"), ("--unseen", tmp_path / "unseen.npz")
+    code, said = refused("held_out", DEFAULT_WEIGHTS, *trained, *unseen, "--resolution", 1000)
+    assert (code, said) == (1, "two of the archives have a shape f, by which figures are named")
+
+
+@pytest.mark.parametrize("name", ["passes", "velocities"])
+def test_of_several_states_one_that_is_none_is_found_out_before_the_work(
+    refused: Refused, name: str, tmp_path: Path
+) -> None:
+    (junk := tmp_path / "junk.safetensors").write_text("junk")
+    code, said = refused(name, DEFAULT_WEIGHTS, junk, "--data", tmp_path)
+    assert (code, said.split(" is ")[0]) == (1, str(junk))
+
+
 @pytest.mark.parametrize("name", ["held_out", "passes", "velocities", "quality", "calibrate"])
 def test_a_file_that_is_missing_is_named_in_one_line(refused: Refused, name: str, tmp_path: Path) -> None:
     gone = tmp_path / "gone.safetensors"
