@@ -37,10 +37,10 @@ def write_chance(path: Path, data: Path, resolutions: Sequence[int] = RESOLUTION
             if what.isdecimal():
                 finest[shape] = max(finest.get(shape, 0), int(what))
         for number, (shape, points) in enumerate(sorted(finest.items())):
-            if wrong := [count for count in resolutions if not PATCH_SIZE <= count <= points]:
-                raise InvalidOptions(f"{shape} can have {PATCH_SIZE} to {points} points, not {wrong[0]}")
-            rng = np.random.default_rng([seed, number])
             surface = read_array(archive, f"{shape}/{points}", data)
+            if wrong := [count for count in resolutions if not PATCH_SIZE <= count <= len(surface)]:
+                raise InvalidOptions(f"{shape} can have {PATCH_SIZE} to {len(surface)} points, not {wrong[0]}")
+            rng = np.random.default_rng([seed, number])
             for count in resolutions:
                 arrays[f"{shape}/{count}"] = surface[rng.choice(len(surface), count, replace=False)]
             arrays[f"{shape}/surface"] = surface

@@ -40,3 +40,9 @@ def test_more_points_than_there_are_or_fewer_than_a_patch_has_are_refused(
 ) -> None:
     with pytest.raises(InvalidOptions, match=f"s0 can have 1000 to 4000 points, not {count}"):
         write_chance(tmp_path / "chance.npz", even, [count])
+
+
+def test_how_many_points_a_cloud_has_is_not_believed_of_its_name(tmp_path: Path) -> None:
+    np.savez(data := tmp_path / "named.npz", **{"s0/9000": sphere(2000)})  # type: ignore[arg-type]
+    with pytest.raises(InvalidOptions, match="s0 can have 1000 to 2000 points, not 3000"):
+        write_chance(tmp_path / "chance.npz", data, [3000])
