@@ -94,11 +94,13 @@ def train(
     missing or unfit, another process trains in run_dir or the run diverges (the last state is kept), DeviceUnavailable,
     and what `PatchSource.read` does.
     """
-    if batch_size % processes or (processes > 1 and device != "cpu"):
-        raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size} on {device!r}")
+    place = torch.device(device_named(device))
+    if batch_size % processes:
+        raise InvalidOptions(f"{processes} processes cannot share batches of {batch_size}: give a multiple of them")
+    if processes > 1 and place.type != "cpu":
+        raise InvalidOptions(f"{processes} processes cannot share batches on {place}: they do so on a CPU")
     if passed and stage != "cvm":
         raise InvalidOptions(f"clouds after passes are for stage 'cvm', not for {stage!r}")
-    place = torch.device(device_named(device))
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)
