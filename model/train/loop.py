@@ -223,6 +223,9 @@ def _network(stage: Stage, init: Path | None, couplings: int, *, resuming: bool)
     else:
         network, _ = read_network(init)
         have = len(network.velocity_modules)
+        # How products round depends on where tensors lie: a file's are mapped, those of a run gone on with are not.
+        for tensor in (*network.parameters(), *network.buffers()):
+            tensor.data = tensor.data.clone()
         if stage == "cvm" and have == 1:
             first = network.velocity_modules[0]
             network.velocity_modules.extend(copy.deepcopy(first) for _ in range(count - 1))

@@ -127,7 +127,8 @@ def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     if "progress" not in metadata:
         raise MalformedFile(f"{path} is no training state: its header has no progress")
     with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
+        # Copies lie where a run's own tensors do, on which rounding depends.
+        return {name: file.get_tensor(name).clone() for name in file.keys()}, metadata  # noqa: SIM118 - not a dict
 
 
 def read_header(path: Path) -> dict[str, str]:

@@ -214,6 +214,16 @@ def test_a_run_starts_from_weights_that_ship_and_takes_their_distance_module(dat
         train("cvm", data=data, run_dir=tmp_path / "none", iterations=1, init=broken)
 
 
+def test_a_run_that_starts_from_weights_that_ship_rounds_as_the_one_that_goes_on_from_it() -> None:
+    # Products round by how their tensors lie in memory, and those of a file lie as they do in the file.
+    network = loop._network("dm", DEFAULT_WEIGHTS, 2, resuming=False)
+    resumed = loop._network("dm", None, 2, resuming=True)
+    resumed.load_state_dict(network.state_dict())
+    assert {p.data_ptr() % 64 for p in (*network.parameters(), *network.buffers()) if p.numel() > 1} == {0}
+    patch = torch.from_numpy(np.random.default_rng(0).standard_normal((1, 1000, 3)).astype(np.float32))
+    assert torch.equal(network.distance_module(0.2 * patch), resumed.distance_module(0.2 * patch))
+
+
 def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: Path, velocity_run: Path) -> None:
     def run(stage: Stage, name: str, init: Path, distance: Path | None = None) -> Path:
         return train(stage, data=data, run_dir=tmp_path / name, iterations=1, batch_size=1, threads=1, init=init,
