@@ -69,7 +69,7 @@ def read_array(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> npt.NDAr
 def _not_unit(normals: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the lengths that are not 1, of normals (N, 3)."""
     lengths = np.linalg.norm(normals.astype(np.float64), axis=1)
-    return lengths[np.abs(lengths - 1) > _LENGTH_SLACK]
+    return np.asarray(lengths[np.abs(lengths - 1) > _LENGTH_SLACK])
 
 
 def by_stem(paths: Sequence[Path]) -> dict[str, Path]:
