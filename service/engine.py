@@ -328,7 +328,7 @@ class Engine:
     async def delete(self, id: str, *, owner: str = "") -> None:
         """Cancel a job if it is not finished, and remove its files and all that is known of it."""
         record = await self.cancel(id, owner=owner)
-        await self._call(JobStore.delete, record.folder)  # its id may be another's by now
+        await self._call(JobStore.delete, id, record.folder)
         await asyncio.to_thread(self._folders.remove, record.folder)
         await asyncio.to_thread(keep_reserve, self._data_dir)
         self._notify(id)

@@ -156,10 +156,10 @@ class JobStore:
             elif row["state"] in _WORKING:
                 self._db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (id,))
 
-    def delete(self, folder: str) -> None:
-        """Remove a folder's job and its events; the fence of whoever works on it is void from now on."""
+    def delete(self, id: str, folder: str) -> None:
+        """Remove a job and its events, not another of its id; the fence of whoever works on it is void from now on."""
         with self._transaction():
-            self._db.execute("DELETE FROM jobs WHERE folder = ?", (folder,))
+            self._db.execute("DELETE FROM jobs WHERE id = ? AND folder = ?", (id, folder))
 
     def load(self, owner: str | None = None) -> Load:
         """Sum up what waits and runs and what is kept, for one owner or for all."""

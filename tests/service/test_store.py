@@ -46,7 +46,7 @@ def test_a_fence_is_void_for_every_later_job_of_its_id_too(tmp_path: Path) -> No
                 assert here.extend([("foo", claim.fence)], 15.0) == ["held"]
                 held.append(claim.fence)
                 assert here.release("foo", claim.fence, "again", expires_in=60)
-            there.delete(str(round))
+            there.delete("foo", str(round))
         assert len(set(held)) == len(held)
 
 
