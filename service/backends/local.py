@@ -92,16 +92,16 @@ class LocalBackend:
             try:
                 await self._offer(spec)
                 delay = FIRST_RESTART_DELAY_SECONDS
+                continue
             except WorkerDied as death:
                 logger.warning("%s; starting another in %g s", death, delay)
-                await asyncio.sleep(delay)
-                delay = min(2 * delay, MAX_RESTART_DELAY_SECONDS)
             except StraightPCFError as error:
                 self._fail(error)
+                continue
             except Exception:  # a machine without a thread left, say: it passes, and jobs wait for this worker
                 logger.exception("a worker could not be looked after; starting another in %g s", delay)
-                await asyncio.sleep(delay)
-                delay = min(2 * delay, MAX_RESTART_DELAY_SECONDS)
+            await asyncio.sleep(delay)
+            delay = min(2 * delay, MAX_RESTART_DELAY_SECONDS)
 
     async def _offer(self, spec: WorkerSpec) -> None:
         """Start a worker, offer it to jobs and return when it has died; raises WorkerDied if it never was ready."""

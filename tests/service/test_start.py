@@ -80,7 +80,6 @@ def test_what_others_have_in_a_data_directory_stays_there(tmp_path: Path) -> Non
         assert not ours.exists()
 
 
-@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no second disk here")
 def test_nobody_else_may_read_what_a_server_makes_in_folders_that_were_there(tmp_path: Path) -> None:
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         backend.go.set()
@@ -99,6 +98,7 @@ def test_nobody_else_may_read_what_a_server_makes_in_folders_that_were_there(tmp
         os.umask(before)
 
 
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no second disk here")
 def test_folders_on_two_disks_are_refused_at_the_start(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm") as other:
         (tmp_path / "jobs").symlink_to(other)
