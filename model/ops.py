@@ -60,11 +60,13 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     """
     want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
     whole = a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
-    if a.is_cuda and whole and not want_grad:
+    if a.is_cuda and whole:
         from straightpcf.model.kernels import cuda
 
-        if cuda.load():
+        if not want_grad and cuda.load():
             return cuda.edge_max(a, b, index.int(), weight)
+        if want_grad and index.shape[2] == cuda.EDGES and cuda.load_gradient():
+            return cuda.EdgeMax.apply(a, b, index.int(), weight)  # type: ignore[no-untyped-call,no-any-return]
     plain = whole and a.dtype == torch.float32 and index.dtype == torch.int32
     library = cpu.load() if plain and a.device.type == "cpu" else None
     if library is None:

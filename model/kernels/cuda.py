@@ -1,4 +1,4 @@
-"""The same loops for CUDA, in Triton: neighbour search, the EdgeConv maximum without the edge tensor, farthest points.
+"""The same loops for CUDA, in Triton: neighbour search, the EdgeConv maximum and its gradient, farthest points.
 
 Tested through Triton's interpreter and compiled for Hopper; not yet run on a GPU (docs/kernels.md). Where Triton is
 missing, or the kernels do not do what their torch twins do, `load()` returns False and the twins do the work.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import warnings
+from collections.abc import Callable
 
 import torch
 
@@ -18,23 +19,36 @@ try:
 except ImportError:  # a CPU build of torch comes without it
     triton = None
 
-__all__ = ["MOST_FARTHEST", "MOST_POINTS", "edge_max", "farthest", "knn", "load"]
+__all__ = ["EDGES", "MOST_FARTHEST", "MOST_POINTS", "EdgeMax", "edge_max", "farthest", "knn", "load", "load_gradient"]
 
 MOST_POINTS = 2048  # of a patch; its indices fill the low bits of a key, and a warp's registers hold two rows of keys
 _ROWS = 2
 _DIRECT = 8  # with fewer channels distances are differences, exact; with more, products
-_EDGE_POINTS = 4  # whose 32 edges each make a tile of 128 rows
+EDGES = 32  # of a point, for the gradient: an edge's number fills the low bits of a sum
+_EDGE_POINTS = 4  # whose edges make a tile of 128 rows
 MOST_FARTHEST = 1 << 17  # points; of more, one program is slower than launches over the whole device
 _FARTHEST_BLOCK = 4096
+_LARGEST_GRADIENT = 1024.0  # what a gradient's largest value is scaled to: float16 keeps what is 1e-9 of it
+_WEIGHT_PROGRAMS = 264  # that share the edges among them for a weight's gradient: two for each multiprocessor
 
 
 @functools.cache
 def load() -> bool:
     """Tell whether the kernels run on this machine's GPU, each once in the shapes that the filter has."""
+    return _proven(_prove)
+
+
+@functools.cache
+def load_gradient() -> bool:
+    """Tell whether those do that training needs beside."""
+    return load() and _proven(_prove_gradient)
+
+
+def _proven(prove: Callable[[torch.device, int], None]) -> bool:
     if triton is None or os.environ.get("STRAIGHTPCF_NO_KERNELS"):
         return False
     try:
-        _prove(torch.device("cuda"), 1000)
+        prove(torch.device("cuda"), 1000)
     except Exception as exc:  # the compiler's own errors have no common base
         warnings.warn(f"the Triton kernels do not run here, plain torch does: {exc}", stacklevel=2)
         return False
@@ -63,14 +77,67 @@ def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
 
 def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Do what `ops.edge_max` does, in float16 products with float32 sums; channels a multiple of 16, no gradient."""
+    return _maximum(_half(a), _half(b), index.contiguous(), _half(weight), None)
+
+
+class EdgeMax(torch.autograd.Function):
+    """max_n W relu(a_i + b_index[i, n]) and its gradient, for 32 edges a point; shapes as in `ops.edge_max`.
+
+    No tensor of edges reaches memory in either direction: hidden rows are computed again. Only the winning edge of each
+    (point, channel) has a gradient, which a tile of edges takes as a matrix of mostly zeros, for the tensor cores.
+    """
+
+    @staticmethod
+    def forward(ctx, a, b, index, weight):  # type: ignore[no-untyped-def]
+        """Take the maximum as `edge_max` does, and remember the edge that has it."""
+        a, b, index, weight = _half(a), _half(b), index.contiguous(), _half(weight)
+        won = torch.empty(*a.shape[:2], weight.shape[0], dtype=torch.uint8, device=a.device)
+        out = _maximum(a, b, index, weight, won)
+        ctx.save_for_backward(a, b, index, weight, won)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        """Follow the winning edges back; sums over points have no fixed order."""
+        a, b, index, weight, won = ctx.saved_tensors
+        (batch, rows, channels), points, (out_channels, _) = a.shape, b.shape[1], weight.shape
+        scale = _LARGEST_GRADIENT / grad.abs().amax().clamp(min=torch.finfo(torch.float32).tiny * _LARGEST_GRADIENT)
+        scaled = _half(grad * scale)
+        grad_a = torch.empty(a.shape, dtype=torch.float32, device=a.device)
+        grad_b = torch.zeros(b.shape, dtype=torch.float32, device=a.device)
+        grad_weight = torch.zeros(weight.shape, dtype=torch.float32, device=a.device)
+        tiles = triton.cdiv(rows, _EDGE_POINTS)
+        width = min(128, triton.next_power_of_2(channels))
+        out_width = min(128, triton.next_power_of_2(out_channels))
+        _hidden_gradient[batch, tiles, triton.cdiv(channels, width)](
+            scaled, won, a, b, index, weight, grad_a, grad_b, points, rows, channels,
+            OUT_CHANNELS=out_channels, STEP=min(64, out_channels & -out_channels),
+            K=index.shape[2], ROWS=_EDGE_POINTS, WIDTH=width, num_warps=8,
+        )  # fmt: skip
+        _weight_gradient[
+            min(_WEIGHT_PROGRAMS, batch * tiles), triton.cdiv(out_channels, out_width), triton.cdiv(channels, width)
+        ](
+            scaled, won, a, b, index, grad_weight, points, rows, channels, out_channels, tiles, batch * tiles,
+            K=index.shape[2], ROWS=_EDGE_POINTS, WIDTH=width, OUT_WIDTH=out_width, num_warps=8,
+        )  # fmt: skip
+        return grad_a / scale, grad_b / scale, None, grad_weight / scale
+
+
+def _half(x: torch.Tensor) -> torch.Tensor:
+    return x.to(torch.float16).contiguous()
+
+
+def _maximum(
+    a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, won: torch.Tensor | None
+) -> torch.Tensor:
     batch, rows, channels = a.shape
     out_channels, k = weight.shape[0], index.shape[2]
     out = torch.empty(batch, rows, out_channels, dtype=torch.float32, device=a.device)
     width = min(128, triton.next_power_of_2(out_channels))
     _edge_max[batch, triton.cdiv(rows, _EDGE_POINTS), triton.cdiv(out_channels, width)](
-        a.to(torch.float16).contiguous(), b.to(torch.float16).contiguous(), index.contiguous(),
-        weight.to(torch.float16).contiguous(), out, b.shape[1], rows, out_channels,
-        CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_EDGE_POINTS, WIDTH=width, num_warps=8,
+        a, b, index, weight, out, out if won is None else won, b.shape[1], rows, out_channels,
+        CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_EDGE_POINTS, WIDTH=width,
+        WON=won is not None, num_warps=8,
     )  # fmt: skip
     return out
 
@@ -103,6 +170,37 @@ def _prove(device: torch.device, points: int) -> None:
     cloud = torch.randn(5000, 3, device=device, generator=generator)
     if not torch.equal(farthest(cloud, 8, 1), device_patches.farthest_torch(cloud, 8, 1)):
         raise RuntimeError("other farthest points")
+
+
+def _prove_gradient(device: torch.device, points: int) -> None:
+    """Raise unless the maximum over edges has its twin's gradient in each shape of the shipped network."""
+    from straightpcf.model import ops  # it imports this module
+
+    generator = torch.Generator(device).manual_seed(0)
+    for width, rows in ((32, points), (64, points), (256, points), (256, 1 + points // 4)):
+        a, b = torch.randn(2, 2, points, width, device=device, generator=generator)
+        weight = torch.randn(width, width, device=device, generator=generator) / width**0.5
+        index = ops.knn(b[:, :, :3].contiguous(), 32, rows)
+        upstream = torch.randn(2, rows, width, device=device, generator=generator)
+        of = a[:, :rows].contiguous(), b, weight
+        found, expected = (
+            _gradients(EdgeMax.apply, of, index, upstream),
+            _gradients(ops.edge_max_torch, of, index, upstream),
+        )
+        for ours, theirs in zip(found, expected, strict=True):  # of edges that are nearly equal either may win
+            if not (ours - theirs).norm() < 5e-2 * theirs.norm():
+                raise RuntimeError(f"another gradient of the maximum over edges of {width} channels")
+
+
+def _gradients(
+    maximum: Callable[..., torch.Tensor],
+    of: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    index: torch.Tensor,
+    upstream: torch.Tensor,
+) -> tuple[torch.Tensor, ...]:
+    with torch.enable_grad():
+        a, b, weight = (each.clone().requires_grad_() for each in of)
+        return torch.autograd.grad(maximum(a, b, index, weight), (a, b, weight), upstream)
 
 
 def _distances(x: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
@@ -156,10 +254,14 @@ if triton is not None:
 
     @triton.jit  # type: ignore[untyped-decorator]
     def _edge_max(  # type: ignore[no-untyped-def]
-        a, b, index, weight, out, points, rows, out_channels,
+        a, b, index, weight, out, won, points, rows, out_channels,
         CHANNELS: tl.constexpr, STEP: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr,
+        WON: tl.constexpr,
     ):  # fmt: skip
-        """Gather, add, ReLU, multiply and take the maximum over the neighbours, for ROWS points of one patch."""
+        """Gather, add, ReLU, multiply and take the maximum over the neighbours, for ROWS points of one patch.
+
+        Where WON, which neighbour has it comes out too: it takes the place of a sum's last bits.
+        """
         patch = tl.program_id(0).to(tl.int64)
         first = tl.program_id(1) * ROWS
         edge = tl.arange(0, ROWS * K)
@@ -175,10 +277,77 @@ if triton is not None:
             hidden = tl.clamp(mine.to(tl.float32) + theirs.to(tl.float32), 0.0, 65504.0).to(tl.float16)
             w = tl.load(weight + d[None, :] * CHANNELS + c[:, None], mask=(d < out_channels)[None, :], other=0.0)
             total = tl.dot(hidden, w, total)
-        best = tl.max(tl.reshape(total, (ROWS, K, WIDTH)), axis=1)
         i = first + tl.arange(0, ROWS)
         inside = (i < rows)[:, None] & (d < out_channels)[None, :]
-        tl.store(out + (patch * rows + i)[:, None] * out_channels + d[None, :], best, mask=inside)
+        place = (patch * rows + i)[:, None] * out_channels + d[None, :]
+        if WON:
+            bits = (total.to(tl.int32, bitcast=True) & -K) | (edge % K)[:, None]
+            total = bits.to(tl.float32, bitcast=True)
+        best = tl.max(tl.reshape(total, (ROWS, K, WIDTH)), axis=1)
+        tl.store(out + place, best, mask=inside)
+        if WON:
+            tl.store(won + place, (best.to(tl.int32, bitcast=True) & (K - 1)).to(tl.uint8), mask=inside)
+
+    @triton.jit  # type: ignore[untyped-decorator]
+    def _hidden_gradient(  # type: ignore[no-untyped-def]
+        grad, won, a, b, index, weight, grad_a, grad_b, points, rows, channels,
+        OUT_CHANNELS: tl.constexpr, STEP: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr,
+    ):  # fmt: skip
+        """Lead the gradient of a maximum back to both shares of the hidden rows, for ROWS points of one patch."""
+        patch = tl.program_id(0).to(tl.int64)
+        first = tl.program_id(1) * ROWS
+        edge = tl.arange(0, ROWS * K)
+        own = first + edge // K
+        there = own < rows
+        other = tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+        c = tl.program_id(2) * WIDTH + tl.arange(0, WIDTH)
+        total = tl.zeros([ROWS * K, WIDTH], tl.float32)
+        for start in range(0, OUT_CHANNELS, STEP):
+            d = start + tl.arange(0, STEP)
+            place = (patch * rows + own)[:, None] * OUT_CHANNELS + d[None, :]
+            upstream = tl.load(grad + place, mask=there[:, None], other=0.0)
+            winner = tl.load(won + place, mask=there[:, None], other=0)
+            upstream = tl.where(winner.to(tl.int32) == (edge % K)[:, None], upstream, 0.0)
+            w = tl.load(weight + d[:, None] * channels + c[None, :], mask=(c < channels)[None, :], other=0.0)
+            total = tl.dot(upstream, w, total)
+        inside = there[:, None] & (c < channels)[None, :]
+        place_b = (patch * points + other)[:, None] * channels + c[None, :]
+        mine = tl.load(a + (patch * rows + own)[:, None] * channels + c[None, :], mask=inside, other=0.0)
+        theirs = tl.load(b + place_b, mask=inside, other=0.0)
+        total = tl.where(mine.to(tl.float32) + theirs.to(tl.float32) > 0.0, total, 0.0)
+        i = first + tl.arange(0, ROWS)
+        sums = tl.sum(tl.reshape(total, (ROWS, K, WIDTH)), axis=1)
+        inside_a = (i < rows)[:, None] & (c < channels)[None, :]
+        tl.store(grad_a + (patch * rows + i)[:, None] * channels + c[None, :], sums, mask=inside_a)
+        tl.atomic_add(grad_b + place_b, total, mask=inside & (total != 0.0), sem="relaxed")
+
+    @triton.jit  # type: ignore[untyped-decorator]
+    def _weight_gradient(  # type: ignore[no-untyped-def]
+        grad, won, a, b, index, grad_weight, points, rows, channels, out_channels, tiles_each, tiles,
+        K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr, OUT_WIDTH: tl.constexpr,
+    ):  # fmt: skip
+        """Add up the gradient of the weight over a share of the edges, ROWS points' at a time."""
+        edge = tl.arange(0, ROWS * K)
+        d = tl.program_id(1) * OUT_WIDTH + tl.arange(0, OUT_WIDTH)
+        c = tl.program_id(2) * WIDTH + tl.arange(0, WIDTH)
+        total = tl.zeros([OUT_WIDTH, WIDTH], tl.float32)
+        for tile in range(tl.program_id(0), tiles, tl.num_programs(0)):
+            patch = (tile // tiles_each).to(tl.int64)
+            own = (tile % tiles_each) * ROWS + edge // K
+            there = own < rows
+            other = tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+            inside = there[:, None] & (c < channels)[None, :]
+            mine = tl.load(a + (patch * rows + own)[:, None] * channels + c[None, :], mask=inside, other=0.0)
+            theirs = tl.load(b + (patch * points + other)[:, None] * channels + c[None, :], mask=inside, other=0.0)
+            hidden = tl.clamp(mine.to(tl.float32) + theirs.to(tl.float32), 0.0, 65504.0).to(tl.float16)
+            place = (patch * rows + own)[:, None] * out_channels + d[None, :]
+            wanted = there[:, None] & (d < out_channels)[None, :]
+            upstream = tl.load(grad + place, mask=wanted, other=0.0)
+            winner = tl.load(won + place, mask=wanted, other=0)
+            upstream = tl.where(winner.to(tl.int32) == (edge % K)[:, None], upstream, 0.0)
+            total = tl.dot(tl.trans(upstream), hidden, total)
+        inside = (d < out_channels)[:, None] & (c < channels)[None, :]
+        tl.atomic_add(grad_weight + d[:, None] * channels + c[None, :], total, mask=inside, sem="relaxed")
 
     @triton.jit  # type: ignore[untyped-decorator]
     def _farthest(xyz, apart, seeds, count, wanted, first, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]

@@ -52,6 +52,13 @@ class OnCuda(TorchFunctionMode):
         return True if func == torch.Tensor.is_cuda.__get__ else func(*args, **(kwargs or {}))  # type: ignore[attr-defined]
 
 
+class Launched:
+    """A kernel that is given meta tensors, and does nothing."""
+
+    def __getitem__(self, grid: Any) -> Any:
+        return lambda *tensors, **constants: None
+
+
 @pytest.fixture(autouse=True)
 def shapes_for_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
@@ -60,8 +67,15 @@ def shapes_for_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         return a.new_empty((*a.shape[:2], len(weight)))
 
-    for name, shaped in {"load": lambda: True, "knn": knn, "edge_max": edge_max}.items():
+    for name, shaped in {
+        "load": lambda: True,
+        "load_gradient": lambda: cuda.triton is not None,
+        "knn": knn,
+        "edge_max": edge_max,
+    }.items():
         monkeypatch.setattr(cuda, name, shaped)
+    for kernel in ("_edge_max", "_hidden_gradient", "_weight_gradient"):  # of `EdgeMax`
+        monkeypatch.setattr(cuda, kernel, Launched(), raising=False)
 
 
 def on_device() -> StraightPCF:

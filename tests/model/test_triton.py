@@ -37,7 +37,8 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     index = ops.knn_torch(b, 32, 22)
     found, expected = cuda.edge_max(a[:, :22], b, index.int(), weight), ops.edge_max_torch(a[:, :22], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
-cuda._prove(torch.device(device), 1000 if device == "cuda" else 40)
+for prove in (cuda._prove, cuda._prove_gradient):
+    prove(torch.device(device), 1000 if device == "cuda" else 40)
 cloud = torch.randn(9000, 3, generator=generator).to(device)
 for wanted, first in ((1, 0), (8, 1), (8, 8999)):
     assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
@@ -72,7 +73,11 @@ for width in (16, 32, 64, 128, 256):
     cuda.edge_max(a, b, index, torch.zeros(width, width))
 for count, wanted, first in ((50_000, 150, 0), (50_000, 150, 1), (50_000, 150, 7), (333, 1, 1)):
     cuda.farthest(torch.zeros(count, 3), wanted, first)
-assert len(made) == 16, made
+for width, rows in ((32, 1000), (64, 1000), (256, 1000), (256, 256)):
+    a, b = torch.zeros(2, rows, width), torch.zeros(2, 1000, width)
+    index = torch.zeros(2, rows, 32, dtype=torch.int32)
+    cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(width, width)), index, torch.ones(2, rows, width))
+assert len(made) == 28, made
 assert all(kernel.asm["cubin"] and kernel.metadata.shared <= 227 * 1024 for kernel in made)
 print("compiled")
 """
