@@ -27,23 +27,46 @@ class SOAP(torch.optim.Optimizer):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Make one update from the gradients that are there."""
         for group in self.param_groups:
-            for parameter in group["params"]:
-                gradient = parameter.grad
-                if gradient is None:
-                    continue
-                state = self.state[parameter]
+            parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
+            gradients = [parameter.grad for parameter in parameters]
+            states = [self.state[parameter] for parameter in parameters]
+            for state, gradient in zip(states, gradients, strict=True):
                 if not state:
                     self._start(state, gradient)
-                if gradient.ndim == 2:
-                    state["left"].lerp_(gradient @ gradient.T, 1 - _FACTOR_BETA)
-                    state["right"].lerp_(gradient.T @ gradient, 1 - _FACTOR_BETA)
-                turned = _into_basis(gradient, state)
-                state["step"].add_(1)
-                state["mean"].lerp_(gradient, 1 - _BETAS[0])
-                state["square"].lerp_(turned.square(), 1 - _BETAS[1])
-                mean = _into_basis(state["mean"], state) / (1 - _BETAS[0] ** state["step"])
-                square = state["square"] / (1 - _BETAS[1] ** state["step"])
-                parameter.sub_(_out_of_basis(mean / (square.sqrt() + _EPS), state) * group["lr"])
+            self._update(parameters, gradients, states, group["lr"])
+
+    @staticmethod
+    def _update(
+        parameters: list[torch.Tensor],
+        gradients: list[torch.Tensor],
+        states: list[dict[str, torch.Tensor]],
+        rate: float | torch.Tensor,
+    ) -> None:
+        """Update the parameters and their states; what is done to each alike is one kernel on a GPU."""
+        if not parameters:
+            return
+        steps, means, squares = ([state[name] for state in states] for name in ("step", "mean", "square"))
+        factors = [(s, g) for s, g in zip(states, gradients, strict=True) if g.ndim == 2]
+        for side, products in (("left", [g @ g.T for _, g in factors]), ("right", [g.T @ g for _, g in factors])):
+            if factors:
+                torch._foreach_lerp_([state[side] for state, _ in factors], products, 1 - _FACTOR_BETA)
+        turned = [_into_basis(gradient, state) for gradient, state in zip(gradients, states, strict=True)]
+        torch._foreach_add_(steps, 1)
+        torch._foreach_lerp_(means, gradients, 1 - _BETAS[0])
+        torch._foreach_lerp_(squares, torch._foreach_mul(turned, turned), 1 - _BETAS[1])
+        # What of the sums has been there since the start.
+        shares = [torch._foreach_neg(torch._foreach_pow(beta, steps)) for beta in _BETAS]
+        for share in shares:
+            torch._foreach_add_(share, 1)
+        change = torch._foreach_div(
+            [_into_basis(mean, state) for mean, state in zip(means, states, strict=True)], shares[0]
+        )
+        size = torch._foreach_sqrt(torch._foreach_div(squares, shares[1]))
+        torch._foreach_add_(size, _EPS)
+        torch._foreach_div_(change, size)
+        change = [_out_of_basis(each, state) for each, state in zip(change, states, strict=True)]
+        torch._foreach_mul_(change, rate)
+        torch._foreach_sub_(parameters, change)
 
     @torch.no_grad()
     def turn_bases(self) -> None:
