@@ -2,7 +2,7 @@
 
 python -m benchmarks.held_out model/weights/straightpcf.safetensors runs/cvm/state.safetensors [--unseen solids1.npz]
     [--shapes boy02 solid001] [--resolution 10000] [--random] [--noise 0.02 0.03] [--noise-type gaussian]
-    [--iterations 4]
+    [--iterations 4] [--device cuda]
 
 CD / mean squared height over the surface, x1e-4, in radii of the bounding sphere, of each shape, and their geometric
 and arithmetic means over shapes and seeds: the one weighs all shapes alike, the other shows walls that are joined. The
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.command import errors_in_one_line, noise_level, positive, seed_number
+from benchmarks.command import device, errors_in_one_line, noise_level, positive, seed_number
 from benchmarks.passes import Truth
 from benchmarks.quality import SHARED
 from benchmarks.shapes import NOISE_TYPES, make_noise
@@ -54,6 +54,7 @@ def main() -> None:
         "--seeds", type=seed_number, nargs="+", default=[0, 1], help="of the noise; one is too little to judge by"
     )
     parser.add_argument("--iterations", default="4", help='of all candidates, "auto" or 1..10')
+    parser.add_argument("--device", type=device, default="cpu", help='"cpu" (the default), "cuda" or "cuda:N"')
     parser.add_argument("--threads", type=positive)
     arguments = parser.parse_args()
     options = DenoiseOptions.parse(iterations=arguments.iterations)
@@ -64,7 +65,7 @@ def main() -> None:
         truths[shape] = truth
     if not truths:
         parser.error("no shape of these names is held out")
-    candidates = {path: _filter(path, arguments.threads) for path in arguments.candidates}
+    candidates = {path: _filter(path, arguments.device, arguments.threads) for path in arguments.candidates}
     print("CD / height of", " | ".join(truths))
     for noise in arguments.noise:
         for path, model in candidates.items():
@@ -93,12 +94,12 @@ def _truths(arguments: argparse.Namespace) -> Iterator[tuple[str, Truth]]:
                     raise InvalidOptions(f"{path} has no {shape}/{arguments.resolution}; --random draws any number")
 
 
-def _filter(path: Path, threads: int | None) -> Filter:
+def _filter(path: Path, device: str, threads: int | None) -> Filter:
     """Put a candidate's velocities beside the rest of what ships."""
     network, _ = read_network(path)
     take_distance_module(network, DEFAULT_WEIGHTS)
     calibration = Calibration.from_metadata(read_checkpoint(DEFAULT_WEIGHTS)[1])
-    return Filter(network, calibration=calibration, threads=threads)
+    return Filter(network.to(device), calibration=calibration, device=device, threads=threads)
 
 
 def _measured(
