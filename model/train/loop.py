@@ -39,6 +39,7 @@ _WARMUP = 200
 _TURN_EVERY = 10  # iterations between two turns of the optimiser's bases
 _EMA_DECAY = 0.999
 _LOG_EVERY = 50
+_SAVE_SECONDS = {"cpu": 0.0, "cuda": 20.0}  # between two states: a GPU makes an iteration while one file is written
 _VALIDATE_EVERY = 250
 _VALIDATION_PATCHES = 64
 
@@ -130,7 +131,7 @@ def train(
             stage_loss = partial(coupled_loss, rows=rows, euler_steps=euler_steps)
         loss_of = partial(stage_loss, network)
         held_out = PatchSource.read(*archives, validation=True)
-        fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False)
+        fixed = held_out.draw(np.random.default_rng(1), _VALIDATION_PATCHES, augment=False).to(place)
         _cut_log(run_dir / _LOG_FILE, start)
         share = batch_size // processes
         team = None
@@ -143,7 +144,7 @@ def train(
             if place.type == "cuda"
             else HostStep(source, loss_of, trained, optimiser, rng, share, team)
         )
-        began = time.monotonic()
+        began = saved_at = time.monotonic()
         validation: float | None = None
         file = lent.enter_context((run_dir / _LOG_FILE).open("a", newline=""))
         log = csv.writer(file)
@@ -165,14 +166,15 @@ def train(
                 if not math.isfinite(recent_loss):
                     raise _diverged(f"the loss is {recent_loss}", iteration, saved, learning_rate, state_path)
             if (iteration % _VALIDATE_EVERY == 0 or last) and not stopping:  # who interrupts does not wait for long
-                validation = _validate(stage_loss, network, average, fixed.to(place))
+                validation = _validate(stage_loss, network, average, fixed)
             if iteration % _LOG_EVERY == 0 or last or stopping:
-                progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
-                            "learning_rate": learning_rate, "validation": validation}  # fmt: skip
-                if not average.is_finite():  # the loss says so an iteration later, and the old state would be gone
-                    raise _diverged("weights are not finite", iteration, saved, learning_rate, state_path)
-                save_state(state_path, network, average, optimiser, rng, progress)
-                saved = iteration
+                if last or stopping or time.monotonic() - saved_at >= _SAVE_SECONDS[place.type]:
+                    progress = {"stage": stage, "iteration": iteration, "seed": seed, "batch_size": batch_size,
+                                "learning_rate": learning_rate, "validation": validation}  # fmt: skip
+                    if not average.is_finite():  # the loss says so an iteration later, and the old state would be gone
+                        raise _diverged("weights are not finite", iteration, saved, learning_rate, state_path)
+                    save_state(state_path, network, average, optimiser, rng, progress)
+                    saved, saved_at = iteration, time.monotonic()
                 seconds = round(time.monotonic() - began, 1)
                 log.writerow([stage, iteration, round(float(np.mean(recent)), 5), validation, rate, seconds])
                 file.flush()

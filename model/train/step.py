@@ -65,6 +65,7 @@ class GraphedStep:
             group["lr"] = self._rate  # a graph reads it from memory
         self._eager_left = _EAGER_STEPS
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._side: torch.cuda.Stream | None = None  # one: each keeps the memory of an iteration
         self._result = torch.zeros((), device=device)
         self._run: Callable[[], torch.Tensor] = lambda: _update(self._source.draw(batch_size), loss, trained, optimiser)
 
@@ -75,7 +76,7 @@ class GraphedStep:
             self._graph.replay()
         elif self._eager_left > 0:
             self._eager_left -= 1
-            side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+            side = self._side = self._side or torch.cuda.Stream()  # type: ignore[no-untyped-call]
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
                 self._result = self._run()

@@ -342,6 +342,21 @@ def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, t
     assert read_network(path)[1]["iteration"] == 1
 
 
+def test_a_device_that_is_fast_saves_no_more_often_than_its_seconds_say_and_at_the_end(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "_LOG_EVERY", 1)
+    monkeypatch.setitem(loop._SAVE_SECONDS, "cpu", 3600.0)
+    there = []
+    path = train(
+        "vm", data=data, run_dir=tmp_path, iterations=3, batch_size=1, threads=1,
+        on_step=lambda _: there.append((tmp_path / loop.STATE_FILE).exists()),
+    )  # fmt: skip
+    assert there == [False, False, True]
+    assert read_network(path)[1]["iteration"] == 3
+    assert len((tmp_path / "log.csv").read_text().splitlines()) == 4
+
+
 @pytest.mark.parametrize("what", ["the loss is nan at iteration 3", "weights are not finite at iteration 4"])
 def test_a_run_that_diverges_says_what_to_do_and_keeps_its_last_good_state(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
