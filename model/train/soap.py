@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 
 import torch
 
@@ -11,6 +12,7 @@ __all__ = ["SOAP"]
 _BETAS = (0.9, 0.99)
 _FACTOR_BETA = 0.99
 _EPS = 1e-8
+_STREAMS = 8
 
 
 class SOAP(torch.optim.Optimizer):
@@ -64,21 +66,36 @@ class SOAP(torch.optim.Optimizer):
         size = torch._foreach_sqrt(torch._foreach_div(squares, shares[1]))
         torch._foreach_add_(size, _EPS)
         torch._foreach_div_(change, size)
-        change = [_out_of_basis(each, state) for each, state in zip(change, states, strict=True)]
-        torch._foreach_mul_(change, rate)
-        torch._foreach_sub_(parameters, change)
+        moves = [_out_of_basis(each, state) for each, state in zip(change, states, strict=True)]
+        torch._foreach_mul_(moves, rate)
+        torch._foreach_sub_(parameters, moves)
 
     @torch.no_grad()
     def turn_bases(self) -> None:
         """Take one step of the power iteration that keeps the bases at the factors' eigenvectors, in place."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                state = self.state[parameter]
-                for axis, side in enumerate(("left", "right") if "left" in state else ()):
-                    factor, basis = state[side], state[f"{side}_basis"]
-                    order = (basis * (factor @ basis)).sum(dim=0).argsort(descending=True)
-                    basis.copy_(torch.linalg.qr(factor @ basis[:, order]).Q)
-                    state["square"].copy_(state["square"].index_select(axis, order))
+        kept = (self.state[parameter] for group in self.param_groups for parameter in group["params"])
+        matrices = [state for state in kept if "left" in state]
+        if not matrices or (device := matrices[0]["left"].device).type != "cuda":
+            for state in matrices:
+                self._turn(state)
+            return
+        # A decomposition is a hundred small kernels, one after the other: those of several matrices run side by side.
+        streams, current = _streams(device), torch.cuda.current_stream(device)
+        for stream in streams:
+            stream.wait_stream(current)
+        for number, state in enumerate(matrices):
+            with torch.cuda.stream(streams[number % len(streams)]):
+                self._turn(state)
+        for stream in streams:
+            current.wait_stream(stream)
+
+    @staticmethod
+    def _turn(state: dict[str, torch.Tensor]) -> None:
+        for axis, side in enumerate(("left", "right")):
+            factor, basis = state[side], state[f"{side}_basis"]
+            order = (basis * (factor @ basis)).sum(dim=0).argsort(descending=True)
+            basis.copy_(torch.linalg.qr(factor @ basis[:, order]).Q)
+            state["square"].copy_(state["square"].index_select(axis, order))
 
     @staticmethod
     def _start(state: dict[str, torch.Tensor], gradient: torch.Tensor) -> None:
@@ -91,6 +108,11 @@ class SOAP(torch.optim.Optimizer):
                 # In float64: of a gradient of low rank, LAPACK's float32 eigenvectors have come out as NaN.
                 basis = torch.linalg.eigh(factor.double()).eigenvectors.flip(1)
                 state[f"{side}_basis"] = basis.to(factor.dtype, memory_format=torch.contiguous_format)
+
+
+@cache
+def _streams(device: torch.device) -> list[torch.cuda.Stream]:
+    return [torch.cuda.Stream(device) for _ in range(_STREAMS)]  # type: ignore[no-untyped-call]
 
 
 def _into_basis(x: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
