@@ -349,7 +349,8 @@ if triton is not None:
         inside = (d < out_channels)[:, None] & (c < channels)[None, :]
         tl.atomic_add(grad_weight + d[:, None] * channels + c[None, :], total, mask=inside, sem="relaxed")
 
-    @triton.jit  # type: ignore[untyped-decorator]
+    # Else it is compiled again for counts that are multiples of 16, and for seeds of 1 and 0: eighteen times.
+    @triton.jit(do_not_specialize=["count", "wanted", "first"])  # type: ignore[untyped-decorator]
     def _farthest(xyz, apart, seeds, count, wanted, first, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
         """Take the point farthest from those taken, again and again, in one program; xyz: (3, count)."""
         lane = tl.arange(0, BLOCK)
