@@ -113,7 +113,7 @@ def test_passes(tmp_path: Path) -> None:
     assert 0 < across < 4  # the noise's own is 4
 
 
-@pytest.mark.parametrize("name", ["quality", "speed", "kernels"])
+@pytest.mark.parametrize("name", ["quality", "speed", "kernels", "held_out"])
 def test_a_device_is_named_as_the_filter_takes_it(refused: Refused, name: str) -> None:
     for device, why in (("cuda:99", "cuda:99 was asked for, and torch sees"), ("tpu", "'tpu'; it must be")):
         code, said = refused(name, "--device", device)
