@@ -188,7 +188,7 @@ def _prove_gradient(device: torch.device, points: int) -> None:
             _gradients(ops.edge_max_torch, of, index, upstream),
         )
         for ours, theirs in zip(found, expected, strict=True):  # of edges that are nearly equal either may win
-            if not (ours - theirs).norm() < 5e-2 * theirs.norm():
+            if not (ours - theirs).norm() < 1e-1 * theirs.norm():
                 raise RuntimeError(f"another gradient of the maximum over edges of {width} channels")
 
 
