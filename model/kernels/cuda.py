@@ -25,11 +25,13 @@ MOST_POINTS = 2048  # of a patch; its indices fill the low bits of a key, and a 
 _ROWS = 2
 _DIRECT = 8  # with fewer channels distances are differences, exact; with more, products
 EDGES = 32  # of a point, for the gradient: an edge's number fills the low bits of a sum
+# The tilings are what was fastest of some dozens on an H200 (docs/kernels.md).
 _EDGE_POINTS = 4  # whose edges make a tile of 128 rows
+_GRADIENT_POINTS, _GRADIENT_WIDTH = 2, 128  # of a tile that is led back: smaller, for more of them wait for memory
 MOST_FARTHEST = 1 << 17  # points; of more, one program is slower than launches over the whole device
 _FARTHEST_BLOCK = 4096
 _LARGEST_GRADIENT = 1024.0  # what a gradient's largest value is scaled to: float16 keeps what is 1e-9 of it
-_WEIGHT_PROGRAMS = 264  # that share the edges among them for a weight's gradient: two for each multiprocessor
+_WEIGHT_PROGRAMS = 264  # that make a weight's gradient, a part of it of some of the edges: two for a multiprocessor
 
 
 @functools.cache
@@ -70,7 +72,8 @@ def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
         given, squares = torch.bmm(x[:, :rows], x.mT), x.square().sum(dim=2)
     _nearest[batch, triton.cdiv(rows, _ROWS)](
         given, squares, out, points, rows,
-        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=size, ROOM=31 - size.bit_length(), num_warps=1,
+        CHANNELS=channels if direct else 0, K=k, FEW=points <= k, ROWS=_ROWS, POINTS=size,
+        ROOM=31 - size.bit_length(), num_warps=1,
     )  # fmt: skip
     return out
 
@@ -106,19 +109,20 @@ class EdgeMax(torch.autograd.Function):
         grad_a = torch.empty(a.shape, dtype=torch.float32, device=a.device)
         grad_b = torch.zeros(b.shape, dtype=torch.float32, device=a.device)
         grad_weight = torch.zeros(weight.shape, dtype=torch.float32, device=a.device)
-        tiles = triton.cdiv(rows, _EDGE_POINTS)
-        width = min(128, triton.next_power_of_2(channels))
-        out_width = min(128, triton.next_power_of_2(out_channels))
-        _hidden_gradient[batch, tiles, triton.cdiv(channels, width)](
+        width = min(_GRADIENT_WIDTH, triton.next_power_of_2(channels))
+        _hidden_gradient[batch, triton.cdiv(rows, _GRADIENT_POINTS), triton.cdiv(channels, width)](
             scaled, won, a, b, index, weight, grad_a, grad_b, points, rows, channels,
             OUT_CHANNELS=out_channels, STEP=min(64, out_channels & -out_channels),
-            K=index.shape[2], ROWS=_EDGE_POINTS, WIDTH=width, num_warps=8,
+            K=index.shape[2], ROWS=_GRADIENT_POINTS, WIDTH=width, num_warps=4,
         )  # fmt: skip
-        _weight_gradient[
-            min(_WEIGHT_PROGRAMS, batch * tiles), triton.cdiv(out_channels, out_width), triton.cdiv(channels, width)
-        ](
+        tiles = triton.cdiv(rows, _EDGE_POINTS)
+        width = min(256, triton.next_power_of_2(channels))
+        out_width = min(128, triton.next_power_of_2(out_channels))
+        parts = triton.cdiv(out_channels, out_width), triton.cdiv(channels, width)
+        _weight_gradient[min(_WEIGHT_PROGRAMS // (parts[0] * parts[1]), batch * tiles), *parts](
             scaled, won, a, b, index, grad_weight, points, rows, channels, out_channels, tiles, batch * tiles,
             K=index.shape[2], ROWS=_EDGE_POINTS, WIDTH=width, OUT_WIDTH=out_width, num_warps=8,
+            num_stages=1,
         )  # fmt: skip
         return grad_a / scale, grad_b / scale, None, grad_weight / scale
 
@@ -133,7 +137,7 @@ def _maximum(
     batch, rows, channels = a.shape
     out_channels, k = weight.shape[0], index.shape[2]
     out = torch.empty(batch, rows, out_channels, dtype=torch.float32, device=a.device)
-    width = min(128, triton.next_power_of_2(out_channels))
+    width = min(256, triton.next_power_of_2(out_channels))
     _edge_max[batch, triton.cdiv(rows, _EDGE_POINTS), triton.cdiv(out_channels, width)](
         a, b, index, weight, out, out if won is None else won, b.shape[1], rows, out_channels,
         CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_EDGE_POINTS, WIDTH=width,
@@ -214,9 +218,10 @@ if triton is not None:
     @triton.jit  # type: ignore[untyped-decorator]
     def _nearest(  # type: ignore[no-untyped-def]
         x, squares, out, points, rows,
-        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr, ROOM: tl.constexpr,
+        CHANNELS: tl.constexpr, K: tl.constexpr, FEW: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr,
+        ROOM: tl.constexpr,
     ):  # fmt: skip
-        """Select the K nearest of all points for ROWS points of one patch, by K minima inside one warp.
+        """Select the K nearest of all points for ROWS points of one patch, inside one warp.
 
         x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points, and `squares`
         their squared lengths. A key is ROOM bits of a distance above the point's index: one comparison finds both.
@@ -245,12 +250,34 @@ if triton is not None:
         length = (reach.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 126  # in bits: the exponent of a float
         key = ((bits - least[:, None]) >> tl.maximum(length - ROOM, 0)[:, None]) * POINTS + j[None, :]
         key = tl.where(valid, key, 0x7FFFFFFF)
-        last = tl.zeros([ROWS], tl.int32)
-        for n in range(K):
-            nearest = tl.min(key, axis=1)
-            last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)  # too few points: the farthest again
-            tl.store(out + (patch * rows + i) * K + n, last, mask=i < rows)
-            key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
+        place = (patch * rows + i) * K
+        if FEW:  # fewer than K others: the farthest again and again
+            last = tl.zeros([ROWS], tl.int32)
+            for n in range(K):
+                nearest = tl.min(key, axis=1)
+                last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)
+                tl.store(out + place + n, last, mask=i < rows)
+                key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
+        else:
+            # A key that K keys do not exceed, found by interpolation and bisection in turn: no two keys are equal.
+            low, high = tl.min(key, axis=1) - 1, tl.max(tl.where(valid, key, -1), axis=1)
+            below, above = (
+                tl.zeros([ROWS], tl.int32),
+                tl.sum(valid.to(tl.int32), axis=1),
+            )  # how many do not exceed these
+            rounds = 0
+            while tl.max(above, axis=0) > K:
+                share = (K - below).to(tl.float32) / tl.maximum(above - below, 1).to(tl.float32)
+                step = tl.where(rounds % 2 == 0, ((high - low).to(tl.float32) * share).to(tl.int32), (high - low) >> 1)
+                guess = low + tl.minimum(tl.maximum(step, 1), tl.maximum(high - low - 1, 1))
+                count = tl.sum((key <= guess[:, None]).to(tl.int32), axis=1)
+                open_, enough = above > K, count >= K
+                high, above = tl.where(open_ & enough, guess, high), tl.where(open_ & enough, count, above)
+                low, below = tl.where(open_ & ~enough, guess, low), tl.where(open_ & ~enough, count, below)
+                rounds += 1
+            chosen = (key <= high[:, None]) & valid
+            n = tl.cumsum(chosen.to(tl.int32), axis=1) - 1
+            tl.store(out + place[:, None] + n, key & (POINTS - 1), mask=chosen)
 
     @triton.jit  # type: ignore[untyped-decorator]
     def _edge_max(  # type: ignore[no-untyped-def]
