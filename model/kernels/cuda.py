@@ -72,8 +72,7 @@ def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
         given, squares = torch.bmm(x[:, :rows], x.mT), x.square().sum(dim=2)
     _nearest[batch, triton.cdiv(rows, _ROWS)](
         given, squares, out, points, rows,
-        CHANNELS=channels if direct else 0, K=k, FEW=points <= k, ROWS=_ROWS, POINTS=size,
-        ROOM=31 - size.bit_length(), num_warps=1,
+        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=size, ROOM=31 - size.bit_length(), num_warps=1,
     )  # fmt: skip
     return out
 
@@ -218,10 +217,9 @@ if triton is not None:
     @triton.jit  # type: ignore[untyped-decorator]
     def _nearest(  # type: ignore[no-untyped-def]
         x, squares, out, points, rows,
-        CHANNELS: tl.constexpr, K: tl.constexpr, FEW: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr,
-        ROOM: tl.constexpr,
+        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr, ROOM: tl.constexpr,
     ):  # fmt: skip
-        """Select the K nearest of all points for ROWS points of one patch, inside one warp.
+        """Select the K nearest of all points for ROWS points of one patch, by K minima inside one warp.
 
         x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points, and `squares`
         their squared lengths. A key is ROOM bits of a distance above the point's index: one comparison finds both.
@@ -250,34 +248,12 @@ if triton is not None:
         length = (reach.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 126  # in bits: the exponent of a float
         key = ((bits - least[:, None]) >> tl.maximum(length - ROOM, 0)[:, None]) * POINTS + j[None, :]
         key = tl.where(valid, key, 0x7FFFFFFF)
-        place = (patch * rows + i) * K
-        if FEW:  # fewer than K others: the farthest again and again
-            last = tl.zeros([ROWS], tl.int32)
-            for n in range(K):
-                nearest = tl.min(key, axis=1)
-                last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)
-                tl.store(out + place + n, last, mask=i < rows)
-                key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
-        else:
-            # A key that K keys do not exceed, found by interpolation and bisection in turn: no two keys are equal.
-            low, high = tl.min(key, axis=1) - 1, tl.max(tl.where(valid, key, -1), axis=1)
-            below, above = (
-                tl.zeros([ROWS], tl.int32),
-                tl.sum(valid.to(tl.int32), axis=1),
-            )  # how many do not exceed these
-            rounds = 0
-            while tl.max(above, axis=0) > K:
-                share = (K - below).to(tl.float32) / tl.maximum(above - below, 1).to(tl.float32)
-                step = tl.where(rounds % 2 == 0, ((high - low).to(tl.float32) * share).to(tl.int32), (high - low) >> 1)
-                guess = low + tl.minimum(tl.maximum(step, 1), tl.maximum(high - low - 1, 1))
-                count = tl.sum((key <= guess[:, None]).to(tl.int32), axis=1)
-                open_, enough = above > K, count >= K
-                high, above = tl.where(open_ & enough, guess, high), tl.where(open_ & enough, count, above)
-                low, below = tl.where(open_ & ~enough, guess, low), tl.where(open_ & ~enough, count, below)
-                rounds += 1
-            chosen = (key <= high[:, None]) & valid
-            n = tl.cumsum(chosen.to(tl.int32), axis=1) - 1
-            tl.store(out + place[:, None] + n, key & (POINTS - 1), mask=chosen)
+        last = tl.zeros([ROWS], tl.int32)
+        for n in range(K):
+            nearest = tl.min(key, axis=1)
+            last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)  # too few points: the farthest again
+            tl.store(out + (patch * rows + i) * K + n, last, mask=i < rows)
+            key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
 
     @triton.jit  # type: ignore[untyped-decorator]
     def _edge_max(  # type: ignore[no-untyped-def]
