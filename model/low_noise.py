@@ -7,14 +7,13 @@ two apart, as long as noise does not tilt it (docs/filter.md, "Little noise").
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods
+from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods, surface_terms
 
 __all__ = ["NeighbourhoodNoise", "low_noise_weight", "wiener_weighted"]
 
@@ -49,30 +48,31 @@ class _Surfaces:
 
 @dataclass(frozen=True)
 class NeighbourhoodNoise:
-    """What surfaces fitted to neighbours leave of the points of a patch.
+    """What surfaces fitted to neighbours leave of the points of M patches, all (M,).
 
-    in_radii, std: their noise, in radii of the neighbourhoods and in the unit of the points; loud_share: how many of
+    in_radii, stds: their noise, in radii of the neighbourhoods and in the unit of the points; loud_shares: how many of
     them are many times that noise off their neighbours' surface.
     """
 
-    in_radii: float
-    std: float
-    loud_share: float
+    in_radii: Floats
+    stds: Floats
+    loud_shares: Floats
 
     @classmethod
-    def of(cls, near: Nearest) -> NeighbourhoodNoise:
-        """Look at the nearest points of some."""
+    def of(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
+        """Look at the nearest points of some, as many of each patch, patch after patch."""
         here = _surfaces(near.first(_FIT_NEIGHBOURS))
-        std = float(np.quantile(here.stds, _NOISE_QUANTILE))
-        loud_share = float(np.mean(np.abs(here.own_residuals) > _OUTLIER_STDS * std))
-        return cls(float(np.quantile(here.stds / here.radii, _NOISE_QUANTILE)), std, loud_share)
+        left, own, radii = (a.reshape(patches, -1) for a in (here.stds, here.own_residuals, here.radii))
+        stds = np.quantile(left, _NOISE_QUANTILE, axis=1)
+        loud_shares = (np.abs(own) > _OUTLIER_STDS * stds[:, None]).mean(axis=1)
+        return cls(np.quantile(left / radii, _NOISE_QUANTILE, axis=1), stds, loud_shares)
 
 
-def low_noise_weight(ratios: Sequence[float]) -> float:
+def low_noise_weight(ratios: Floats) -> float:
     """Say how little noise a cloud has beside the distances of its points, 0 to 1.
 
-    1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: as of
-    `NeighbourhoodNoise.in_radii`, for each of some patches, of which half say.
+    1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: (M,), as of
+    `NeighbourhoodNoise.in_radii`, of some patches, of which half say.
     """
     return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
@@ -99,8 +99,8 @@ def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
 
 def _surfaces(near: Neighbourhoods) -> _Surfaces:
     """Fit heights of second order over their planes to neighbourhoods."""
-    height, x, y = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    along = near.along_axes() / near.radii[:, None, None]
+    height, terms = along[:, :, 0], surface_terms(along, bent=True)
     products = terms.mT @ terms + _RIDGE * np.eye(_FIT_TERMS)
     solved = np.linalg.solve(products, np.stack([np.einsum("nkp,nk->np", terms, height), terms[:, 0]], axis=-1))
     left = height - np.einsum("nkp,np->nk", terms, solved[:, :, 0])

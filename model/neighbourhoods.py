@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-__all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods"]
+__all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods", "surface_terms"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -51,12 +52,18 @@ class Nearest:
     def of(cls, points: Floats, around: Floats, count: int) -> Nearest:
         """Look up the `count` nearest of `around` (P, 3), or as many as there are, of each of its points (n, 3)."""
         distances, index = cKDTree(around).query(points, k=np.arange(1, min(count, len(around)) + 1))
-        return cls(distances, around[index])
+        return cls(distances, around.take(index, axis=0))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Nearest]) -> Nearest:
+        """Return those of several lookups as of one; k is the same in all."""
+        return cls(np.concatenate([p.distances for p in parts]), np.concatenate([p.points for p in parts]))
 
     def first(self, count: int) -> Neighbourhoods:
         """Return the neighbourhoods of the `count` nearest, or of as many as there are."""
         some = self.points[:, :count]
-        local = some - some.mean(axis=1, keepdims=True)
+        # Their mean, to the bit, in a quarter of the time that `mean` takes.
+        local = some - np.einsum("nkc->nc", some)[:, None] / some.shape[1]
         variances, axes = np.linalg.eigh(local.mT @ local)
         radii = np.maximum(self.distances[:, :count][:, -1], _LEAST_RADIUS)
         return Neighbourhoods(local, radii, variances, axes)
@@ -65,6 +72,20 @@ class Nearest:
 def neighbourhoods(points: Floats, around: Floats, count: int) -> Neighbourhoods:
     """Look up the `count` nearest of `around` (P, 3), or as many as there are, of each of its points (n, 3)."""
     return Nearest.of(points, around, count).first(count)
+
+
+def surface_terms(along: Floats, *, bent: bool) -> Floats:
+    """Return what a plane's heights over n neighbourhoods are made of, (n, k, 3), or a quadric's if bent, (n, k, 6).
+
+    along: (n, k, 3), as of `Neighbourhoods.along_axes`, in radii: heights, then x and y.
+    """
+    _, x, y = np.moveaxis(along, 2, 0)
+    terms = np.empty((*x.shape, 6 if bent else 3))
+    terms[:, :, 0], terms[:, :, 1], terms[:, :, 2] = 1.0, x, y
+    if bent:
+        for term, (left, right) in enumerate(((x, x), (x, y), (y, y)), start=3):
+            np.multiply(left, right, out=terms[:, :, term])
+    return terms
 
 
 def inner_points(points: Floats, *, whole: bool) -> Floats:

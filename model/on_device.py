@@ -41,6 +41,7 @@ _BATCH = 32
 _ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
 _MOST_GRAPHS = 16
 _IN_FLIGHT = 2  # batches of which the results have not been read
+_MOST_THREADS = 8  # of the CPU, beside the device: numpy's threads wait for each other the more the more they are
 
 
 def capture_cuda_graph(run: Callable[[], torch.Tensor]) -> tuple[Callable[[], object], torch.Tensor]:
@@ -123,11 +124,11 @@ class OnDevice:
         batch: int = _BATCH,
         capture: Capture = capture_cuda_graph,
     ) -> None:
-        """Take the network; batch: patches at once, halved when memory runs out; threads: of the CPU."""
+        """Take the network; batch: patches at once, halved when memory runs out; threads: of the CPU, at most."""
         self.device, self.batch, self._network = torch.device(device), batch, network
         self._begins = Graphs(self._begin, capture)
         self._moves = Graphs(self._move, capture)
-        self._pool = ThreadPoolExecutor(threads)
+        self._pool = ThreadPoolExecutor(min(threads, _MOST_THREADS))
         self.mapper: Mapper = self._pool.map
 
     def displacements(

@@ -269,10 +269,10 @@ class Run:
     ) -> _Step:
         """Return the points that a patch owns, their step, and whether it was held back; on any thread."""
         owned, step = cut.owned_points(patch), displacement / scales[patch]
-        if not self.filter.zoom:
+        if not self.filter.zoom or not (reading.scene or reading.sampling.restrains):
             return owned, step, False
         limit = None if trusted_noise is None else trusted_noise[patch]
-        moved, around = self.moved[owned], positions[cut.index[patch]]
+        moved, around = self.moved[owned], positions.take(cut.index[patch], axis=0)
         step, held_back = restrained_step(step, moved, around, sampling=reading.sampling, trusted_noise=limit)
         if reading.height_axis is not None:
             step = along_heights(step, around, reading.height_axis)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -34,6 +35,7 @@ _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
 _NEIGHBOURS_LOOKED_UP = 64  # what the statistics ask for
 _SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, at most, and of all where they are few
+_TOGETHER = 4  # patches looked at in one go: of one numpy calls are so small that threads wait for the interpreter
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,11 @@ class Sampling:
     uncovered: bool = False
     noise_of_most: float = np.inf
 
+    @property
+    def restrains(self) -> bool:
+        """Whether a step of an object is not made as the network asks for it."""
+        return self.irregular or self.thin_walls or self.low_noise > 0
+
     @classmethod
     def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, mapper: Mapper = map) -> Sampling:
         """Look at an object's points (N, 3), with noise of some std, in some of its patches.
@@ -59,39 +66,40 @@ class Sampling:
         mapper: calls a function with the patches' rows, on threads if it has some.
         """
         size, measure = patches.index.shape[1], partial(_PatchStatistics.at, *_looked_at(xyz, patches))
-        found = list(mapper(measure, patches.index))
+        found = list(mapper(measure, _together(patches)))
         thin_walls = has_walls([s.between_walls for s in found])
         areas = np.concatenate([s.areas for s in found])
         noise = [s.noise for s in found]
         noise_of_most = _noise_of_most(noise, noise_std)
         noise_std = min(noise_std, noise_of_most)
         irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(areas, noise_std, thin_walls=thin_walls)
-        low_noise = low_noise_weight([n.in_radii for n in noise])
+        low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
         return cls(irregular, low_noise, thin_walls, noise_of_most=noise_of_most)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
         look = partial(_between_walls, *_looked_at(xyz, patches))
-        return replace(self, thin_walls=self.thin_walls or has_walls(list(mapper(look, patches.index))), uncovered=True)
+        thin_walls = self.thin_walls or has_walls(list(mapper(look, _together(patches))))
+        return replace(self, thin_walls=thin_walls, uncovered=True)
 
 
 @dataclass(frozen=True)
 class _PatchStatistics:
-    """What n points of a patch have around them.
+    """What points of some patches have around them, n in all.
 
     areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; between_walls: as of `between_walls`.
     """
 
     areas: Floats
     noise: NeighbourhoodNoise
-    between_walls: list[bool]
+    between_walls: npt.NDArray[np.bool_]
 
     @classmethod
-    def at(cls, xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> _PatchStatistics:
-        near = _nearest(xyz, samples, whole, rows)
+    def at(cls, xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> _PatchStatistics:
+        near = _nearest(xyz, samples, whole, index)
         last = near.distances.shape[1] - 1
         areas = np.square(near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]])
-        return cls(areas, NeighbourhoodNoise.of(near), between_walls(near))
+        return cls(areas, NeighbourhoodNoise.of(near, len(index)), between_walls(near, len(index)))
 
 
 def _looked_at(xyz: Floats, patches: Patches) -> tuple[Floats, int, bool]:
@@ -99,14 +107,21 @@ def _looked_at(xyz: Floats, patches: Patches) -> tuple[Floats, int, bool]:
     return xyz, max(_SAMPLES, _SAMPLES_OF_ALL // len(patches.index)), len(patches.index) == 1
 
 
-def _nearest(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> Nearest:
-    points = xyz[rows]
-    inner = inner_points(points, whole=whole)
-    return Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP)
+def _together(patches: Patches) -> Iterator[npt.NDArray[np.int32]]:
+    return (patches.index[first : first + _TOGETHER] for first in range(0, len(patches.index), _TOGETHER))
 
 
-def _between_walls(xyz: Floats, samples: int, whole: bool, rows: npt.NDArray[np.int32]) -> list[bool]:
-    return between_walls(_nearest(xyz, samples, whole, rows), uncovered=True)
+def _nearest(xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> Nearest:
+    """Look up the nearest points of some of each patch, index (M, P), in their patch: as many of each."""
+    found = []
+    for points in xyz.take(index, axis=0):
+        inner = inner_points(points, whole=whole)
+        found.append(Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP))
+    return Nearest.joined(found)
+
+
+def _between_walls(xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+    return between_walls(_nearest(xyz, samples, whole, index), len(index), uncovered=True)
 
 
 def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:
@@ -114,8 +129,8 @@ def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:
 
     found: of some patches, of which half say. Where noise is as large as the distance between points, none is loud.
     """
-    noise_of_most = float(np.median([noise.std for noise in found]))
-    loud = np.mean([noise.loud_share for noise in found]) > _LOUD_SHARE
+    noise_of_most = float(np.median(np.concatenate([noise.stds for noise in found])))
+    loud = np.concatenate([noise.loud_shares for noise in found]).mean() > _LOUD_SHARE
     return noise_of_most if loud and noise_std > _LOUD_RATIO * noise_of_most else np.inf
 
 

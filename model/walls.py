@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods
+from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
 __all__ = ["between_walls", "has_walls", "share_between_walls"]
 
@@ -44,30 +44,32 @@ _SAMPLES = 128  # points of a patch that are looked at
 class _Heights:
     """What the neighbours of n points have as heights over their planes, or quadrics.
 
-    thick: (n,) bool, whether the neighbours have more height than an edge; midway: the share of those of thick points
-    that are; noise: the std about walls on both sides, of half of the thick points, or less; normals: (n, 3), the
-    planes'.
+    thick: (n,) bool, whether the neighbours have more height than an edge; midway: (n,), how many of them are;
+    heights: (n, k); fit: those planes or quadrics; normals: (n, 3), the planes'.
     """
 
     thick: npt.NDArray[np.bool_]
-    midway: float
-    noise: float
+    midway: npt.NDArray[np.int64]
+    heights: Floats
+    fit: _LocalFit
     normals: Floats
 
     @classmethod
     def of(cls, near: Neighbourhoods) -> _Heights:
         """Look at the neighbourhoods of n points."""
-        fit = _LocalFit.of(near)
-        height = fit.residuals(near.along_axes()[:, :, 0])
-        stds = np.sqrt(np.square(height).mean(axis=1))
-        thick = stds > _THICK_RATIO * near.radii
-        if not thick.any():
-            return cls(thick, 1.0, 0.0, near.normals)
-        midway = float(np.mean(np.abs(height[thick]) < _MIDWAY_STDS * stds[thick, None]))
-        return cls(thick, midway, float(np.median(fit.noise_about_walls(height)[thick])), near.normals)
+        along = near.along_axes()
+        fit = _LocalFit.of(along, near.radii)
+        heights = fit.residuals(along[:, :, 0])
+        stds = np.sqrt(np.square(heights).mean(axis=1))
+        midway = np.count_nonzero(np.abs(heights) < _MIDWAY_STDS * stds[:, None], axis=1)
+        return cls(stds > _THICK_RATIO * near.radii, midway, heights, fit, near.normals)
 
-    def are_walls(self, few: float) -> bool:
-        return self.midway < few and bool(self.thick.mean() > 0.5)
+    def are_walls(self, few: float, patches: int = 1) -> npt.NDArray[np.bool_]:
+        """Say it of each of some patches that the points are of, as many of each, patch after patch."""
+        thick, midway = self.thick.reshape(patches, -1), self.midway.reshape(patches, -1)
+        share = (thick * midway).sum(axis=1) / np.maximum(1, thick.sum(axis=1) * self.heights.shape[1])
+        walls: npt.NDArray[np.bool_] = (share < few) & (thick.mean(axis=1) > 0.5)
+        return walls
 
     def share_left(self, step: Floats, few: float, full: float = _FULL_STEP_STDS, none: float = _NO_STEP_STDS) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together.
@@ -75,10 +77,11 @@ class _Heights:
         full, none: moves across, in stds of the noise, up to which all is made of it, and from which on nothing.
         """
         thick = self.thick[: len(step)]
-        if not self.are_walls(few) or not thick.any():
+        if not self.are_walls(few).all() or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
-        beside_noise = np.sqrt(np.square(rise).mean()) / max(self.noise, 1e-300)
+        noise = float(np.median(self.fit.noise_about_walls(self.heights)[self.thick]))
+        beside_noise = np.sqrt(np.square(rise).mean()) / max(noise, 1e-300)
         return float(np.clip((none - beside_noise) / (none - full), 0.0, 1.0))
 
 
@@ -93,15 +96,11 @@ class _LocalFit:
     inverse: Floats
 
     @classmethod
-    def of(cls, near: Neighbourhoods) -> _LocalFit:
-        """Take quadrics where there are as many neighbours as _QUADRIC_FROM."""
-        _, u, v = np.moveaxis(near.along_axes() / near.radii[:, None, None], 2, 0)
-        terms = [np.ones_like(u), u, v]
-        if u.shape[1] >= _QUADRIC_FROM:
-            terms += [u * u, u * v, v * v]
-        stacked = np.stack(terms, axis=2)
-        equations = stacked.mT @ stacked + 1e-9 * np.eye(len(terms))  # points in a line leave some of them open
-        return cls(stacked, np.linalg.inv(equations))
+    def of(cls, along: Floats, radii: Floats) -> _LocalFit:
+        """Take quadrics where there are as many neighbours as _QUADRIC_FROM; along: (n, k, 3), as `along_axes` says."""
+        terms = surface_terms(along / radii[:, None, None], bent=along.shape[1] >= _QUADRIC_FROM)
+        equations = terms.mT @ terms + 1e-9 * np.eye(terms.shape[2])  # points in a line leave some of them open
+        return cls(terms, np.linalg.inv(equations).astype(np.float64, copy=False))
 
     def residuals(self, values: Floats) -> Floats:
         """Return what the fits leave of values (n, k)."""
@@ -118,18 +117,20 @@ class _LocalFit:
         return np.sqrt(left)
 
 
-def between_walls(near: Nearest, *, uncovered: bool = False) -> list[bool]:
-    """Say whether points of a patch may be on walls close together, by their nearest 24 and 64.
+def between_walls(near: Nearest, patches: int, *, uncovered: bool = False) -> npt.NDArray[np.bool_]:
+    """Say of M patches whether their points may be on walls close together, by the nearest 24 and 64: (M, 2).
 
-    uncovered: whether a pass has taken the noise of what is one surface.
+    near: of as many points of each patch, patch after patch; uncovered: whether a pass has taken the noise of what is
+    one surface.
     """
     few = _UNCOVERED_MIDWAY_SHARE if uncovered else _MAYBE_WALLS_MIDWAY_SHARE
-    return [_Heights.of(near.first(count)).are_walls(few) for count in _NEIGHBOUR_COUNTS[:2]]
+    found = [_Heights.of(near.first(count)).are_walls(few, patches) for count in _NEIGHBOUR_COUNTS[:2]]
+    return np.stack(found, axis=1)
 
 
-def has_walls(found: Sequence[Sequence[bool]]) -> bool:
+def has_walls(found: Sequence[npt.NDArray[np.bool_]]) -> bool:
     """Say whether a cloud may have walls close together; found: of its patches, or some, as of `between_walls`."""
-    return bool(np.mean(found, axis=0).max() > _WALL_PATCHES_SHARE)
+    return bool(np.concatenate(found).mean(axis=0).max() > _WALL_PATCHES_SHARE)
 
 
 def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False, by_chance: bool = False) -> float:
