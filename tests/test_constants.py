@@ -33,11 +33,12 @@ NOT_TUNED = {
     "neighbourhoods.py": {"_LEAST_RADIUS"},
     "normalize.py": {"_BLOCK"},
     "normals.py": {"_CHUNK"},
-    "on_device.py": {"_BATCH", "_ROWS", "_MOST_GRAPHS", "_IN_FLIGHT"},
+    "on_device.py": {"_BATCH", "_ROWS", "_MOST_GRAPHS", "_IN_FLIGHT", "_MOST_THREADS"},
     "outliers.py": {"_BLOCK"},
     "patches.py": {"_TREE_HEIGHT"},
     "restraint.py": {"_LINE_FREEDOM"},  # of a mean and a direction
     "run.py": {"_HEARD", "_MOVED", "_NOTHING"},
+    "spacing.py": {"_TOGETHER"},
     "spread.py": {"_CHUNKS", "_TINY"},
     "turns.py": {"_PSI"},  # a root that the paper gives
 }

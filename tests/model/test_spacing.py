@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from straightpcf.model import spacing
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
@@ -33,6 +36,16 @@ def test_lines_are_not_even() -> None:
     turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 90, endpoint=False), np.linspace(-0.8, 0.8, 46))
     squares = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), height], axis=-1).reshape(-1, 3)
     assert not irregular(squares, 0.01)
+
+
+@pytest.mark.parametrize("together", [1, 7, 1000])
+def test_how_many_patches_are_looked_at_at_once_changes_nothing(together: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rough = loud(torus(5000), 0.005)
+    patches = cut_patches(rough, coverage=3.0, seed=0)
+    first = Sampling.of(rough, patches, 0.02)
+    monkeypatch.setattr(spacing, "_TOGETHER", together)
+    assert Sampling.of(rough, patches, 0.02) == first
+    assert first.after_pass(rough, patches) == replace(first, uncovered=True)
 
 
 def test_where_nothing_tells_points_are_taken_for_even() -> None:
