@@ -57,7 +57,7 @@ class Reading:
     what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
     scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud; probes: of a scene, the patches that were read.
+    raster, None of any other cloud; probes: the patches that were read.
     """
 
     distance: float
@@ -121,12 +121,9 @@ class NoiseReader:
         noise = self._noise_std(distances, scales)
         zoom, in_radii, high_noise, uneven = 1.0, 0.0, False, False
         parts: tuple[int, ...] = (1,)
-        mapper = self._processor.mapper
         if first is None:
-            sampling = Sampling.of(positions, probes, noise, mapper=mapper)
+            sampling = Sampling.of(positions, probes, noise, mapper=self._processor.mapper)
             in_radii = noise_in_radii(noise, probes.radii)
-        elif distance < _UNCOVERED_BELOW and first.parts == (1,):  # what parts leave lies in layers
-            sampling = first.sampling.after_pass(positions, probes, mapper=mapper)
         else:
             sampling = first.sampling
         if self._zoom:
@@ -144,8 +141,26 @@ class NoiseReader:
             distances = self._processor.distances(positions, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
             known = dict(zip(numbers, distances.tolist(), strict=False))
         return Reading(
-            distance, noise, False, sampling, zoom, parts, in_radii, known, high_noise=high_noise, uneven=uneven
+            distance,
+            noise,
+            False,
+            sampling,
+            zoom,
+            parts,
+            in_radii,
+            known,
+            high_noise=high_noise,
+            uneven=uneven,
+            probes=probes,
         )
+
+    def with_walls(self, positions: Floats, reading: Reading, first: Reading) -> Reading:
+        """Return the reading of what a pass has left, before another: walls that noise had hidden may show now."""
+        covered = reading.distance >= _UNCOVERED_BELOW or first.parts != (1,)  # what parts leave lies in layers
+        if reading is first or reading.scene or covered or reading.probes is None:
+            return reading
+        sampling = first.sampling.after_pass(positions, reading.probes, mapper=self._processor.mapper)
+        return replace(reading, sampling=sampling)
 
     def of_scene(self, positions: Floats, cut: Patches, *, raster: bool) -> ScenePatches:
         """Look at patches of a scene: each has the usual size, and what is flat but for its noise a smaller one.

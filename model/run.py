@@ -144,6 +144,7 @@ class Run:
             if left == 0:
                 self.noise_after = self._noise_left(tiles)
                 return
+            self.readings[-1] = self.reader.with_walls(positions, reading, self.readings[0])
             self.iterations += 1
             self.moved += spread_step
             yield from self._pass(positions, tiling, left)
@@ -186,10 +187,10 @@ class Run:
     def _noise_left(self, tiles: list[npt.NDArray[np.int64]]) -> float:
         """Return the noise std of what comes out: of a scene, and of points that go a part of their way, read anew."""
         first, strength = self.readings[0], self.options.strength
-        if strength == 0.0 or (strength == 1.0 and first.probes is None):
+        if strength == 0.0 or (strength == 1.0 and not first.scene):
             return (self.readings[-1] if strength else first).noise_std
         positions = self.frame.enter(self.points.xyz) + strength * self.moved
-        if first.probes is not None:
+        if first.scene and first.probes is not None:
             return self.reader.noise_left(positions, first, first.probes)
         return self.reader.read(positions, self._tiling(positions, tiles), first).noise_std
 
