@@ -6,7 +6,7 @@ import argparse
 import math
 
 from straightpcf.model.filter import device_named
-from straightpcf.model.train.command import errors_in_one_line, file_to_write, positive, seed_number
+from straightpcf.model.train.command import errors_in_one_line, file_to_write, noise_level, positive, seed_number
 from straightpcf.points.errors import DeviceUnavailable
 
 __all__ = [
@@ -35,14 +35,6 @@ def device(text: str) -> str:
         return device_named(text)
     except DeviceUnavailable as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def noise_level(text: str) -> float:
-    """Read a level of noise, for argparse: NaN would run for minutes and measure nothing."""
-    value = float(text)
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is no level of noise, which is 0 or more")
-    return value
 
 
 def share_of_two(text: str) -> float:

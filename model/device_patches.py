@@ -1,6 +1,6 @@
 """`cut_patches` in batched torch operations: a GPU cuts a cloud while a CPU would still build its tree.
 
-Tested on the CPU against `cut_patches`; not yet run on a GPU.
+Tested on the CPU against `cut_patches`.
 """
 
 from __future__ import annotations

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from straightpcf.points.errors import StraightPCFError
 
-__all__ = ["archive_to_write", "errors_in_one_line", "file_to_write", "positive", "seed_number"]
+__all__ = ["archive_to_write", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
 
 
 @contextmanager
@@ -36,6 +37,14 @@ def file_to_write(text: str) -> Path:
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{path.parent} is no folder to write {path.name} to")
     return path
+
+
+def noise_level(text: str) -> float:
+    """Read a level of noise, for argparse: NaN would run for minutes and measure nothing."""
+    value = float(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no level of noise, which is 0 or more")
+    return value
 
 
 def positive(text: str) -> int:

@@ -21,7 +21,7 @@ from straightpcf.model.filter import Filter, Run, load_filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.tiles import Tiling
 from straightpcf.model.train.archive import by_stem, opened, read_array, split_name, write_archive
-from straightpcf.model.train.command import archive_to_write, errors_in_one_line, positive, seed_number
+from straightpcf.model.train.command import archive_to_write, errors_in_one_line, noise_level, positive, seed_number
 from straightpcf.model.train.data import drawn_noise, held_out_shapes
 from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import InvalidOptions, MalformedFile
@@ -37,25 +37,28 @@ COARSEST_SHARE = 0.75  # of the clouds; a finer one takes several times as long
 _KEPT_EVERY, _PROGRESS = 300.0, "progress"  # seconds
 
 
-def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int, *, seed: int = 0) -> None:
+def write_passed(
+    path: Path, denoiser: Filter, data: Sequence[Path], count: int, *, seed: int = 0, levels: Sequence[float] = LEVELS
+) -> None:
     """Filter `count` noisy training clouds of the archives `data`, and write them as they were before each later pass.
 
-    Shapes that are held out stay out. A cloud is named `<archive>/<shape>/<number>/xyz`, (N, 3) float32 in the
-    frame in which the filter has it; `<archive>/<shape>/<number>/frame` is that one's centre and radius among the clean
-    points. What is there so far is kept beside `path` now and then and where this is interrupted, and gone on with.
-    Raises InvalidOptions where that is of another recording, or two archives have one name, MalformedFile, OSError.
+    levels: noise stds, in radii of the bounding sphere, each as likely. Shapes that are held out stay out. A cloud is
+    named `<archive>/<shape>/<number>/xyz`, (N, 3) float32 in the frame in which the filter has it;
+    `<archive>/<shape>/<number>/frame` is that one's centre and radius among the clean points. What is there so far is
+    kept beside `path` now and then and where this is interrupted, and gone on with. Raises InvalidOptions where that is
+    of another recording, or two archives have one name, MalformedFile, OSError.
     """
     rng = np.random.default_rng(seed)
     by_stem(data)
     shapes = {archive: _training_clouds(archive) for archive in data}
     part = path.with_suffix(".part.npz")
-    of = [seed, [archive.stem for archive in data], _digest(denoiser)]
+    of = [seed, [archive.stem for archive in data], _digest(denoiser), list(levels)]
     written = _gone_on_with(part, of, rng)
     kept_at, state = time.monotonic(), rng.bit_generator.state
     _keep(part, written, of, state)  # a folder that takes no file is found out before the work
     try:
         while len(written) < 2 * count:
-            more = _recorded(denoiser, data, shapes, rng, len(written) // 2)
+            more = _recorded(denoiser, data, shapes, rng, levels, len(written) // 2)
             written, state = written | more, rng.bit_generator.state
             if time.monotonic() - kept_at > _KEPT_EVERY:
                 _keep(part, written, of, state)
@@ -69,7 +72,7 @@ def write_passed(path: Path, denoiser: Filter, data: Sequence[Path], count: int,
 
 def _recorded(
     denoiser: Filter, data: Sequence[Path], shapes: Mapping[Path, Mapping[str, Clouds]], rng: np.random.Generator,
-    number: int,
+    levels: Sequence[float], number: int,
 ) -> dict[str, npt.NDArray[np.generic]]:  # fmt: skip
     """Filter one noisy cloud, and return what is written of it, from that number on."""
     written: dict[str, npt.NDArray[np.generic]] = {}
@@ -80,7 +83,7 @@ def _recorded(
     finer = clouds[1:] if rng.random() >= COARSEST_SHARE else []
     clean = (finer or clouds[:1])[int(rng.integers(len(finer or clouds[:1])))]
     own = CloudFrame.of(clean)
-    noise = LEVELS[int(rng.integers(len(LEVELS)))] * drawn_noise(rng, clean, eye)
+    noise = levels[int(rng.integers(len(levels)))] * drawn_noise(rng, clean, eye)
     run = _Recording(denoiser, own.enter(clean) + noise, DenoiseOptions(iterations=3 if finer else 4))
     for _ in run.patches():
         pass
@@ -101,7 +104,9 @@ def _gone_on_with(part: Path, of: list[object], rng: np.random.Generator) -> dic
             raise MalformedFile(f"{part} is no part of a recording: it has no {_PROGRESS}")
         theirs, state = json.loads(str(file[_PROGRESS]))
         if theirs != of:  # hours of work, perhaps
-            raise InvalidOptions(f"{part} is of another seed, other data or weights: go on with those, or remove it")
+            raise InvalidOptions(
+                f"{part} is of another seed, other data, weights or noise: go on with those, or remove it"
+            )
         rng.bit_generator.state = state
         return {name: file[name] for name in file.files if name != _PROGRESS}
 
@@ -159,6 +164,13 @@ def _main() -> None:
     parser.add_argument("--data", type=Path, action="append", required=True, help="clean clouds; may be given again")
     parser.add_argument("--weights", type=Path, help="a checkpoint or a training state; the shipped weights by default")
     parser.add_argument("--count", type=positive, default=500, help="clouds to record, three of each filtered one")
+    parser.add_argument(
+        "--noise",
+        type=noise_level,
+        nargs="+",
+        default=LEVELS,
+        help="stds, in radii of the bounding sphere, each as likely",
+    )
     parser.add_argument("--seed", type=seed_number, default=0)
     parser.add_argument("--threads", type=positive)
     options = parser.parse_args()
@@ -170,7 +182,7 @@ def _main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     try:
-        write_passed(options.path, denoiser, options.data, options.count, seed=options.seed)
+        write_passed(options.path, denoiser, options.data, options.count, seed=options.seed, levels=options.noise)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; the same command goes on from what it has\n")
         sys.exit(130)

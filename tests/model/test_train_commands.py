@@ -84,10 +84,12 @@ def test_a_part_of_another_recording_is_not_written_over(tmp_path: Path) -> None
     torch.manual_seed(0)
     denoiser = Filter(StraightPCF(width=128, distance_width=128).eval(), threads=1, coverage=2)
     part = tmp_path / "out.part.npz"
-    record._keep(part, {"a": np.ones(3)}, [1, ["data"], 0], {})
+    of_these = [0, ["data"], record._digest(denoiser), [0.02]]
+    record._keep(part, {"a": np.ones(3)}, of_these, {})
     before = part.read_bytes()
-    with pytest.raises(InvalidOptions, match=r"out\.part\.npz is of another seed, other data or weights"):
-        write_passed(tmp_path / "out.npz", denoiser, [data], 1)
+    for other in ({"seed": 1}, {"levels": [0.03]}):
+        with pytest.raises(InvalidOptions, match=r"out\.part\.npz is of another seed, other data, weights or noise"):
+            write_passed(tmp_path / "out.npz", denoiser, [data], 1, **{"levels": [0.02], **other})  # type: ignore[arg-type]
     assert part.read_bytes() == before
     np.savez(part, a=np.ones(3))
     with pytest.raises(MalformedFile, match="is no part of a recording"):
