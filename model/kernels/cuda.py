@@ -31,6 +31,7 @@ _GRADIENT_POINTS, _GRADIENT_WIDTH = 2, 128  # of a tile that is led back: smalle
 MOST_FARTHEST = 1 << 17  # points; of more, one program is slower than launches over the whole device
 _FARTHEST_BLOCK = 4096
 _LARGEST_GRADIENT = 1024.0  # what a gradient's largest value is scaled to: float16 keeps what is 1e-9 of it
+_ROOM_FOR_THREE = 160 * 1024  # bytes that three stages of a tile take, which a block of a gaming card does not have
 _WEIGHT_PROGRAMS = 264  # that make a weight's gradient, a part of it of some of the edges: two for a multiprocessor
 
 
@@ -140,9 +141,17 @@ def _maximum(
     _edge_max[batch, triton.cdiv(rows, _EDGE_POINTS), triton.cdiv(out_channels, width)](
         a, b, index, weight, out, out if won is None else won, b.shape[1], rows, out_channels,
         CHANNELS=channels, STEP=min(64, channels & -channels), K=k, ROWS=_EDGE_POINTS, WIDTH=width,
-        WON=won is not None, num_warps=8,
+        WON=won is not None, num_warps=8, num_stages=3 if _room(a.device) >= _ROOM_FOR_THREE else 2,
     )  # fmt: skip
     return out
+
+
+@functools.cache
+def _room(device: torch.device) -> int:
+    """Return how much memory a block may share, in bytes."""
+    if device.type != "cuda":  # Triton's interpreter
+        return _ROOM_FOR_THREE
+    return int(triton.runtime.driver.active.utils.get_device_properties(device.index)["max_shared_mem"])
 
 
 def farthest(points: torch.Tensor, wanted: int, first: int) -> torch.Tensor:

@@ -79,6 +79,15 @@ for width, rows in ((32, 1000), (64, 1000), (256, 1000), (256, 256)):
     cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(width, width)), index, torch.ones(2, rows, width))
 assert len(made) == 28, made
 assert all(kernel.asm["cubin"] and kernel.metadata.shared <= 227 * 1024 for kernel in made)
+
+# A gaming card has 99 KiB.
+Hopper.get_current_target = lambda self: GPUTarget("cuda", 86, 32)
+Hopper.get_current_device = lambda self: 1
+cuda._room = lambda device: 99 * 1024
+made.clear()
+a, b, index = torch.zeros(2, 384, 256), torch.zeros(2, 1000, 256), torch.zeros(2, 384, 32, dtype=torch.int32)
+cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(256, 256)), index, torch.ones(2, 384, 256))
+assert [kernel.metadata.shared <= 99 * 1024 for kernel in made] == [True] * 3, made
 print("compiled")
 """
 
