@@ -73,11 +73,11 @@ for width in (16, 32, 64, 128, 256):
     cuda.edge_max(a, b, index, torch.zeros(width, width))
 for count, wanted, first in ((50_000, 150, 0), (50_000, 150, 1), (50_000, 150, 7), (333, 1, 1)):
     cuda.farthest(torch.zeros(count, 3), wanted, first)
-for width, rows in ((32, 1000), (64, 1000), (256, 1000), (256, 256)):
+for width, rows in ((32, 1000), (256, 256)):
     a, b = torch.zeros(2, rows, width), torch.zeros(2, 1000, width)
     index = torch.zeros(2, rows, 32, dtype=torch.int32)
     cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(width, width)), index, torch.ones(2, rows, width))
-assert len(made) == 28, made
+assert len(made) == 22, made
 assert all(kernel.asm["cubin"] and kernel.metadata.shared <= 227 * 1024 for kernel in made)
 
 # A gaming card has 99 KiB.
