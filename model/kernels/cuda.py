@@ -265,6 +265,21 @@ if triton is not None:
             key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
 
     @triton.jit  # type: ignore[untyped-decorator]
+    def _edges(index, patch, first, rows, K: tl.constexpr, ROWS: tl.constexpr):  # type: ignore[no-untyped-def]
+        """Return the edges of ROWS points of a patch, the point of each, whether it is there, and its neighbour."""
+        edge = tl.arange(0, ROWS * K)
+        own = first + edge // K
+        there = own < rows
+        return edge, own, there, tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+
+    @triton.jit
+    def _of_winners(grad, won, place, wanted, number):  # type: ignore[no-untyped-def]
+        """Return the gradient of each edge's outputs: the maximum's where the edge, `number` of its point, won."""
+        upstream = tl.load(grad + place, mask=wanted, other=0.0)
+        winner = tl.load(won + place, mask=wanted, other=0)
+        return tl.where(winner.to(tl.int32) == number[:, None], upstream, 0.0)
+
+    @triton.jit  # type: ignore[untyped-decorator]
     def _edge_max(  # type: ignore[no-untyped-def]
         a, b, index, weight, out, won, points, rows, out_channels,
         CHANNELS: tl.constexpr, STEP: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr,
@@ -276,10 +291,7 @@ if triton is not None:
         """
         patch = tl.program_id(0).to(tl.int64)
         first = tl.program_id(1) * ROWS
-        edge = tl.arange(0, ROWS * K)
-        own = first + edge // K
-        there = own < rows
-        other = tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+        edge, own, there, other = _edges(index, patch, first, rows, K, ROWS)
         d = tl.program_id(2) * WIDTH + tl.arange(0, WIDTH)
         total = tl.zeros([ROWS * K, WIDTH], tl.float32)
         for start in range(0, CHANNELS, STEP):
@@ -308,18 +320,13 @@ if triton is not None:
         """Lead the gradient of a maximum back to both shares of the hidden rows, for ROWS points of one patch."""
         patch = tl.program_id(0).to(tl.int64)
         first = tl.program_id(1) * ROWS
-        edge = tl.arange(0, ROWS * K)
-        own = first + edge // K
-        there = own < rows
-        other = tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+        edge, own, there, other = _edges(index, patch, first, rows, K, ROWS)
         c = tl.program_id(2) * WIDTH + tl.arange(0, WIDTH)
         total = tl.zeros([ROWS * K, WIDTH], tl.float32)
         for start in range(0, OUT_CHANNELS, STEP):
             d = start + tl.arange(0, STEP)
             place = (patch * rows + own)[:, None] * OUT_CHANNELS + d[None, :]
-            upstream = tl.load(grad + place, mask=there[:, None], other=0.0)
-            winner = tl.load(won + place, mask=there[:, None], other=0)
-            upstream = tl.where(winner.to(tl.int32) == (edge % K)[:, None], upstream, 0.0)
+            upstream = _of_winners(grad, won, place, there[:, None], edge % K)
             w = tl.load(weight + d[:, None] * channels + c[None, :], mask=(c < channels)[None, :], other=0.0)
             total = tl.dot(upstream, w, total)
         inside = there[:, None] & (c < channels)[None, :]
@@ -339,24 +346,19 @@ if triton is not None:
         K: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr, OUT_WIDTH: tl.constexpr,
     ):  # fmt: skip
         """Add up the gradient of the weight over a share of the edges, ROWS points' at a time."""
-        edge = tl.arange(0, ROWS * K)
         d = tl.program_id(1) * OUT_WIDTH + tl.arange(0, OUT_WIDTH)
         c = tl.program_id(2) * WIDTH + tl.arange(0, WIDTH)
         total = tl.zeros([OUT_WIDTH, WIDTH], tl.float32)
         for tile in range(tl.program_id(0), tiles, tl.num_programs(0)):
             patch = (tile // tiles_each).to(tl.int64)
-            own = (tile % tiles_each) * ROWS + edge // K
-            there = own < rows
-            other = tl.load(index + (patch * rows + own) * K + edge % K, mask=there, other=0)
+            edge, own, there, other = _edges(index, patch, (tile % tiles_each) * ROWS, rows, K, ROWS)
             inside = there[:, None] & (c < channels)[None, :]
             mine = tl.load(a + (patch * rows + own)[:, None] * channels + c[None, :], mask=inside, other=0.0)
             theirs = tl.load(b + (patch * points + other)[:, None] * channels + c[None, :], mask=inside, other=0.0)
             hidden = tl.clamp(mine.to(tl.float32) + theirs.to(tl.float32), 0.0, 65504.0).to(tl.float16)
             place = (patch * rows + own)[:, None] * out_channels + d[None, :]
             wanted = there[:, None] & (d < out_channels)[None, :]
-            upstream = tl.load(grad + place, mask=wanted, other=0.0)
-            winner = tl.load(won + place, mask=wanted, other=0)
-            upstream = tl.where(winner.to(tl.int32) == (edge % K)[:, None], upstream, 0.0)
+            upstream = _of_winners(grad, won, place, wanted, edge % K)
             total = tl.dot(tl.trans(upstream), hidden, total)
         inside = (d < out_channels)[:, None] & (c < channels)[None, :]
         tl.atomic_add(grad_weight + d[:, None] * channels + c[None, :], total, mask=inside, sem="relaxed")
