@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods, surface_terms
 
 __all__ = ["NeighbourhoodNoise", "low_noise_weight", "wiener_weighted"]
@@ -40,10 +41,10 @@ class _Surfaces:
     only; radii: (n,), of the neighbourhoods; normals: (n, 3), of length 1.
     """
 
-    stds: Floats
-    own_residuals: Floats
-    radii: Floats
-    normals: Floats
+    stds: Array
+    own_residuals: Array
+    radii: Array
+    normals: Array
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ class NeighbourhoodNoise:
         """Look at the nearest points of some, as many of each patch, patch after patch."""
         here = _surfaces(near.first(_FIT_NEIGHBOURS))
         left, own, radii = (a.reshape(patches, -1) for a in (here.stds, here.own_residuals, here.radii))
-        stds = np.quantile(left, _NOISE_QUANTILE, axis=1)
-        loud_shares = (np.abs(own) > _OUTLIER_STDS * stds[:, None]).mean(axis=1)
-        return cls(np.quantile(left / radii, _NOISE_QUANTILE, axis=1), stds, loud_shares)
+        quantile = namespace(left).quantile
+        stds = quantile(left, _NOISE_QUANTILE, 1)
+        loud_shares = (abs(own) > _OUTLIER_STDS * stds[:, None]).sum(1) / own.shape[1]
+        return cls(*map(on_host, (quantile(left / radii, _NOISE_QUANTILE, 1), stds, loud_shares)))
 
 
 def low_noise_weight(ratios: Floats) -> float:
@@ -101,10 +103,12 @@ def _surfaces(near: Neighbourhoods) -> _Surfaces:
     """Fit heights of second order over their planes to neighbourhoods."""
     along = near.along_axes() / near.radii[:, None, None]
     height, terms = along[:, :, 0], surface_terms(along, bent=True)
-    products = terms.mT @ terms + _RIDGE * np.eye(_FIT_TERMS)
-    solved = np.linalg.solve(products, np.stack([np.einsum("nkp,nk->np", terms, height), terms[:, 0]], axis=-1))
-    left = height - np.einsum("nkp,np->nk", terms, solved[:, :, 0])
-    leverage = np.einsum("np,np->n", terms[:, 0], solved[:, :, 1])
-    own_residuals = left[:, 0] / np.maximum(1 - leverage, _LEAST_LEVERAGE_LEFT)
-    stds = np.sqrt(np.square(left).sum(axis=1) / (height.shape[1] - _FIT_TERMS))
+    xp, products = namespace(terms), terms.mT @ terms
+    for term in range(_FIT_TERMS):
+        products[:, term, term] += _RIDGE
+    solved = xp.linalg.solve(products, xp.stack([xp.einsum("nkp,nk->np", terms, height), terms[:, 0]], -1))
+    left = height - xp.einsum("nkp,np->nk", terms, solved[:, :, 0])
+    leverage = xp.einsum("np,np->n", terms[:, 0], solved[:, :, 1])
+    own_residuals = left[:, 0] / (1 - leverage).clip(min=_LEAST_LEVERAGE_LEFT)
+    stds = xp.sqrt(xp.square(left).sum(1) / (height.shape[1] - _FIT_TERMS))
     return _Surfaces(stds * near.radii, own_residuals * near.radii, near.radii, near.normals)

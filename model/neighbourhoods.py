@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-__all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "inner_points", "neighbourhoods", "surface_terms"]
+from straightpcf.model.arrays import Array, namespace
+
+__all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "neighbourhoods", "surface_terms"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -25,28 +27,27 @@ class Neighbourhoods:
     1, the first the normal of the plane that fits them best; variances: (n, 3), k times those along the axes, rising.
     """
 
-    local: Floats
-    radii: Floats
-    variances: Floats
-    axes: Floats
+    local: Array
+    radii: Array
+    variances: Array
+    axes: Array
 
     @property
-    def normals(self) -> Floats:
+    def normals(self) -> Array:
         """The planes' normals, (n, 3)."""
         return self.axes[:, :, 0]
 
-    def along_axes(self) -> Floats:
+    def along_axes(self) -> Array:
         """Return the points as distances along the axes, (n, k, 3): the first is the height over the plane."""
-        along: Floats = self.local @ self.axes
-        return along
+        return self.local @ self.axes
 
 
 @dataclass(frozen=True)
 class Nearest:
     """The k nearest points of each of n, itself first. distances: (n, k), rising; points: (n, k, 3)."""
 
-    distances: Floats
-    points: Floats
+    distances: Array
+    points: Array
 
     @classmethod
     def of(cls, points: Floats, around: Floats, count: int) -> Nearest:
@@ -61,11 +62,11 @@ class Nearest:
 
     def first(self, count: int) -> Neighbourhoods:
         """Return the neighbourhoods of the `count` nearest, or of as many as there are."""
-        some = self.points[:, :count]
+        xp, some = namespace(self.points), self.points[:, :count]
         # Their mean, to the bit, in a quarter of the time that `mean` takes.
-        local = some - np.einsum("nkc->nc", some)[:, None] / some.shape[1]
-        variances, axes = np.linalg.eigh(local.mT @ local)
-        radii = np.maximum(self.distances[:, :count][:, -1], _LEAST_RADIUS)
+        local = some - xp.einsum("nkc->nc", some)[:, None] / some.shape[1]
+        variances, axes = xp.linalg.eigh(local.mT @ local)
+        radii = self.distances[:, :count][:, -1].clip(min=_LEAST_RADIUS)
         return Neighbourhoods(local, radii, variances, axes)
 
 
@@ -74,24 +75,13 @@ def neighbourhoods(points: Floats, around: Floats, count: int) -> Neighbourhoods
     return Nearest.of(points, around, count).first(count)
 
 
-def surface_terms(along: Floats, *, bent: bool) -> Floats:
+def surface_terms(along: Array, *, bent: bool) -> Array:
     """Return what a plane's heights over n neighbourhoods are made of, (n, k, 3), or a quadric's if bent, (n, k, 6).
 
     along: (n, k, 3), as of `Neighbourhoods.along_axes`, in radii: heights, then x and y.
     """
-    _, x, y = np.moveaxis(along, 2, 0)
-    terms = np.empty((*x.shape, 6 if bent else 3))
-    terms[:, :, 0], terms[:, :, 1], terms[:, :, 2] = 1.0, x, y
+    xp, x, y = namespace(along), along[:, :, 1], along[:, :, 2]
+    terms = [xp.ones_like(x), x, y]
     if bent:
-        for term, (left, right) in enumerate(((x, x), (x, y), (y, y)), start=3):
-            np.multiply(left, right, out=terms[:, :, term])
-    return terms
-
-
-def inner_points(points: Floats, *, whole: bool) -> Floats:
-    """Return those points of a patch (P, 3) whose neighbours are in it, too: (n, 3), from the middle outwards.
-
-    whole: whether the patch is a whole cloud; then they are all.
-    """
-    middle = np.square(points - points.mean(axis=0)).sum(axis=1)
-    return points[np.argsort(middle)[: len(points) if whole else round(INNER_SHARE * len(points))]]
+        terms += [x * x, x * y, y * y]
+    return xp.stack(terms, -1)

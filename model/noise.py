@@ -122,7 +122,7 @@ class NoiseReader:
         zoom, in_radii, high_noise, uneven = 1.0, 0.0, False, False
         parts: tuple[int, ...] = (1,)
         if first is None:
-            sampling = Sampling.of(positions, probes, noise, mapper=self._processor.mapper)
+            sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
             in_radii = noise_in_radii(noise, probes.radii)
         else:
             sampling = first.sampling
@@ -159,7 +159,7 @@ class NoiseReader:
         covered = reading.distance >= _UNCOVERED_BELOW or first.parts != (1,)  # what parts leave lies in layers
         if reading is first or reading.scene or covered or reading.probes is None:
             return reading
-        sampling = first.sampling.after_pass(positions, reading.probes, mapper=self._processor.mapper)
+        sampling = first.sampling.after_pass(positions, reading.probes, survey=self._processor.survey)
         return replace(reading, sampling=sampling)
 
     def of_scene(self, positions: Floats, cut: Patches, *, raster: bool) -> ScenePatches:

@@ -9,7 +9,7 @@ import functools
 import math
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -23,8 +23,9 @@ from straightpcf.model.agreement import Agreement
 from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
-from straightpcf.model.processor import Finish, Floats, Mapper, Network, cut_out
+from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
 from straightpcf.model.spread import TANGENT_NEIGHBOURS, spread_among
+from straightpcf.model.survey import survey_on
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
 
@@ -128,7 +129,6 @@ class OnDevice:
         self._begins = Graphs(self._begin, capture)
         self._moves = Graphs(self._move, capture)
         self._pool = ThreadPoolExecutor(min(threads, _MOST_THREADS))
-        self.mapper: Mapper = self._pool.map
 
     def displacements(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
@@ -177,22 +177,36 @@ class OnDevice:
 
         Raises TooLarge where it has no memory for them.
         """
-        nearest = min(TANGENT_NEIGHBOURS, PATCH_SIZE - 1, len(positions) - 1)
         with current(self.device), enough_memory(self.device, len(positions)):
             points = torch.from_numpy(positions).to(self.device)
-            around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
-            for cut in tiling.cuts():
-                sent = _DeviceCut.of(cut, np.ones(len(cut.seeds)), {}, self.device)
-                for _ in self._batched(cut, partial(_look_around, points, cut, sent, around)):
-                    pass
-            moved: Floats = spread_among(points, around, limit).cpu().numpy()
+            moved: Floats = spread_among(points, self._around(points, tiling, TANGENT_NEIGHBOURS), limit).cpu().numpy()
         return moved
+
+    @torch.inference_mode()
+    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> npt.NDArray[np.int32]:
+        """Look up the nearest others of each point in the patch that owns it. Raises TooLarge as `spread` does."""
+        with current(self.device), enough_memory(self.device, len(positions)):
+            return self._around(torch.from_numpy(positions).to(self.device), tiling, count).cpu().numpy()
+
+    def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
+        """Look at all patches at once. Raises TooLarge where the device has no memory for them."""
+        return survey_on(self.device, positions, patches, measure)
 
     def _sent(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float]
     ) -> tuple[torch.Tensor, _DeviceCut]:
         with current(self.device), enough_memory(self.device, len(positions)):
             return torch.from_numpy(positions).to(self.device), _DeviceCut.of(cut, scales, known_distances, self.device)
+
+    def _around(self, points: torch.Tensor, tiling: Tiling, count: int) -> torch.Tensor:
+        """Return the rows of the points nearest to each, as many as there are in a patch: (N, count) int32."""
+        nearest = min(count, PATCH_SIZE - 1, len(points) - 1)
+        around = torch.empty(len(points), nearest, dtype=torch.int32, device=self.device)
+        for cut in tiling.cuts():
+            sent = _DeviceCut.of(cut, np.ones(len(cut.seeds)), {}, self.device)
+            for _ in self._batched(cut, partial(_look_around, points, cut, sent, around)):
+                pass
+        return around
 
     def _batched(self, cut: Patches, call: Callable[[slice], _T]) -> Iterator[_T]:
         """Call with batch after batch of a cut's patches, with halves where memory runs out."""

@@ -14,8 +14,9 @@ import torch
 
 from straightpcf.model.agreement import Agreement
 from straightpcf.model.patches import Patches
-from straightpcf.model.processor import Finish, Floats, Network, cut_out
+from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
 from straightpcf.model.spread import spread
+from straightpcf.model.survey import survey
 from straightpcf.model.tiles import Tiling
 
 __all__ = ["OnHost"]
@@ -87,6 +88,13 @@ class OnHost:
         for rows, own in tiling.surroundings():
             moved[rows[:own]] = spread(positions[rows], limit, workers=self._threads, mapper=self.mapper)[:own]
         return moved
+
+    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> None:
+        """Leave that to a tree."""
+
+    def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
+        """Look at some patches at a time, each time on a thread."""
+        return survey(positions, patches, measure, mapper=self.mapper)
 
     def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
         """Map in order, few results waiting."""

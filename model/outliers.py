@@ -10,13 +10,13 @@ from straightpcf.model.distinct import half_reach
 from straightpcf.model.normalize import CloudFrame, is_scene
 from straightpcf.model.patches import PATCH_SIZE
 
-__all__ = ["FAR_OUT", "far_out", "isolated"]
+__all__ = ["FAR_OUT", "NEIGHBOURS", "far_out", "isolated"]
 
 # A row so many times as far out as half of the rows are is a file's sign for "no data". With it, float64 would hold all
 # others in one place.
 FAR_OUT = 1e12
 
-_NEIGHBOURS = 8  # what lies in a group of more belongs to something
+NEIGHBOURS = 8  # what lies in a group of more belongs to something
 # How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
 # with 3 % of Gaussian noise none is beyond the first pair; the second is for what is near the surface, once the far is
 # gone. Laplace noise has a few beyond the first: so few are noise, but for those that make the bounding sphere larger.
@@ -45,13 +45,20 @@ def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return far
 
 
-def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[np.bool_]:
+def isolated(
+    xyz: npt.NDArray[np.float64], *, workers: int = 1, nearest: npt.NDArray[np.int32] | None = None
+) -> npt.NDArray[np.bool_]:
     """Say of each point of an object (N, 3) whether it lies apart from all others: (N,).
 
     None does in a scene, whose far parts are sparse, and where more than _MOST_SHARE would. Where some do, everyone's
-    patches have a few, which read as noise that the whole cloud has.
+    patches have a few, which read as noise that the whole cloud has. nearest: (N, 8) rows of each point's nearest
+    others, nearest first, where they have been looked up.
     """
-    beside_most, beside_neighbours = _distances(xyz, workers)
+    if nearest is None:
+        beside_most, beside_neighbours = _distances(xyz, workers)
+    else:
+        reach = np.linalg.norm(xyz.take(nearest[:, -1], axis=0) - xyz, axis=1)
+        beside_most, beside_neighbours = _compared(reach, nearest)
     apart = (beside_most > _FAR_RATIO) | (beside_neighbours > _FAR_NEIGHBOUR_RATIO)
     sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _SHEET_NEIGHBOUR_RATIO), workers)
     apart &= ~sheet
@@ -74,15 +81,22 @@ def isolated(xyz: npt.NDArray[np.float64], *, workers: int = 1) -> npt.NDArray[n
 
 def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return how far each point's 8th neighbour is, beside most points and beside its own neighbours: (N,) each."""
-    count = min(_NEIGHBOURS, len(xyz) - 1)
+    count = min(NEIGHBOURS, len(xyz) - 1)
     tree, reach = cKDTree(xyz), np.empty(len(xyz))
     around = np.empty((len(xyz), count), dtype=np.int32)
     for start in range(0, len(xyz), _BLOCK):
         some = slice(start, start + _BLOCK)
         distance, index = tree.query(xyz[some], k=np.arange(2, count + 2), workers=workers)
         reach[some], around[some] = distance[:, -1], index
-    of_neighbours = np.empty(len(xyz))
-    for start in range(0, len(xyz), _BLOCK):
+    return _compared(reach, around)
+
+
+def _compared(
+    reach: npt.NDArray[np.float64], around: npt.NDArray[np.int32]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return distances (N,) beside those of most points, and beside those of each point's neighbours (N, k)."""
+    of_neighbours, count = np.empty(len(reach)), around.shape[1]
+    for start in range(0, len(reach), _BLOCK):
         some = slice(start, start + _BLOCK)
         rising = np.sort(reach.take(around[some]), axis=1)  # of few, sooner than np.median finds the middle
         of_neighbours[some] = (rising[:, (count - 1) // 2] + rising[:, count // 2]) / 2

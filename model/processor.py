@@ -9,16 +9,18 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
 
-__all__ = ["Finish", "First", "Floats", "Mapper", "Network", "Processor", "cut_out"]
+__all__ = ["Finish", "First", "Floats", "Mapper", "Measure", "Network", "Processor", "cut_out"]
 
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
 Floats = npt.NDArray[np.float64]
 # Velocities of the first evaluation, of as many points as are asked for or more, and what takes their place, (B, P, 3).
 First = tuple[torch.Tensor, torch.Tensor]
+Measure = Callable[[Nearest, int], _T]  # the nearest points of some points of patches, and how many -> what they say
 Finish = Callable[[int, Floats], _T]  # a patch's number and how far its points move -> what is made of it
 
 
@@ -71,9 +73,14 @@ class Processor(Protocol):
     def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
 
-    @property
-    def mapper(self) -> Mapper:
-        """Calls on threads of the CPU."""
+    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> npt.NDArray[np.int32] | None:
+        """Return the rows of each point's nearest others, nearest first, (N, count); None where a tree is as quick.
+
+        tiling: of these positions.
+        """
+
+    def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
+        """Do what a `model.survey.Survey` does."""
 
     def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
         """Return what `model.spread.spread` does; tiling: of the pass before."""

@@ -14,7 +14,7 @@ from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
-from straightpcf.model.outliers import FAR_OUT, far_out, isolated
+from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
 from straightpcf.model.tiles import Tiling, split
@@ -90,10 +90,11 @@ class Run:
             others = f"{self.not_finite} not finite, {self.far_out_count} far out"
             raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
         self._take()
+        self._first: Tiling | None = None  # of the points as they came
         apart = self._apart()
         self.apart_count = int(apart.sum())
         if self.apart_count:
-            self.rows = self.rows[~apart]
+            self.rows, self._first = self.rows[~apart], None
             self._take()
         self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
@@ -116,7 +117,10 @@ class Run:
         """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
         if self.frame.radius == 0.0 or not _FEWEST_APART <= len(self.points.xyz) <= self.filter.tile_points:
             return np.zeros(len(self.rows), dtype=bool)
-        apart = isolated(self.frame.enter(self.points.xyz), workers=self.filter.threads)
+        positions = self.frame.enter(self.points.xyz)
+        self._first = self._tiling(positions)
+        nearest = self.filter.processor.nearest_others(positions, self._first, NEIGHBOURS)
+        apart = isolated(positions, workers=self.filter.threads, nearest=nearest)
         return apart[self.points.inverse]
 
     def patches(self) -> Iterator[FinishedPatch]:
@@ -131,7 +135,7 @@ class Run:
             positions += self.moved
             spread_step = self._spread_step(positions, tiling, planned)
             positions += spread_step
-            tiling = self._tiling(positions, tiles)
+            tiling, self._first = self._first or self._tiling(positions, tiles), None
             reading = self.reader.read(positions, tiling, self.readings[0] if self.readings else None)
             if not self.readings and (edge := self._edge_of_steps(reading)):
                 self.voxel = edge

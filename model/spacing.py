@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.arrays import on_host
 from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
-from straightpcf.model.neighbourhoods import Nearest, inner_points
+from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import Patches
-from straightpcf.model.processor import Floats, Mapper
+from straightpcf.model.processor import Floats
+from straightpcf.model.survey import Survey, survey
 from straightpcf.model.walls import between_walls, has_walls
 
 __all__ = ["Sampling"]
@@ -33,9 +32,6 @@ _LINES_AREA_RATIO = 1.3
 # others, it is the noise of those few.
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
-_NEIGHBOURS_LOOKED_UP = 64  # what the statistics ask for
-_SAMPLES, _SAMPLES_OF_ALL = 128, 2000  # points of a patch that are looked at, at most, and of all where they are few
-_TOGETHER = 4  # patches looked at in one go: of one numpy calls are so small that threads wait for the interpreter
 
 
 @dataclass(frozen=True)
@@ -60,26 +56,22 @@ class Sampling:
         return self.irregular or self.thin_walls or self.low_noise > 0
 
     @classmethod
-    def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, mapper: Mapper = map) -> Sampling:
-        """Look at an object's points (N, 3), with noise of some std, in some of its patches.
-
-        mapper: calls a function with the patches' rows, on threads if it has some.
-        """
-        size, measure = patches.index.shape[1], partial(_PatchStatistics.at, *_looked_at(xyz, patches))
-        found = list(mapper(measure, _together(patches)))
+    def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, survey: Survey = survey) -> Sampling:
+        """Look at an object's points (N, 3), with noise of some std, in some of its patches."""
+        found = list(survey(xyz, patches, _PatchStatistics.of))
         thin_walls = has_walls([s.between_walls for s in found])
         areas = np.concatenate([s.areas for s in found])
         noise = [s.noise for s in found]
         noise_of_most = _noise_of_most(noise, noise_std)
         noise_std = min(noise_std, noise_of_most)
-        irregular = size >= _LEAST_PATCH_POINTS and _is_irregular(areas, noise_std, thin_walls=thin_walls)
+        irregular = patches.index.shape[1] >= _LEAST_PATCH_POINTS
+        irregular = irregular and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
         return cls(irregular, low_noise, thin_walls, noise_of_most=noise_of_most)
 
-    def after_pass(self, xyz: Floats, patches: Patches, *, mapper: Mapper = map) -> Sampling:
+    def after_pass(self, xyz: Floats, patches: Patches, *, survey: Survey = survey) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
-        look = partial(_between_walls, *_looked_at(xyz, patches))
-        thin_walls = self.thin_walls or has_walls(list(mapper(look, _together(patches))))
+        thin_walls = self.thin_walls or has_walls(list(survey(xyz, patches, _uncovered_walls)))
         return replace(self, thin_walls=thin_walls, uncovered=True)
 
 
@@ -95,33 +87,15 @@ class _PatchStatistics:
     between_walls: npt.NDArray[np.bool_]
 
     @classmethod
-    def at(cls, xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> _PatchStatistics:
-        near = _nearest(xyz, samples, whole, index)
+    def of(cls, near: Nearest, patches: int) -> _PatchStatistics:
+        """Look at the nearest points of some, as many of each patch, patch after patch."""
         last = near.distances.shape[1] - 1
-        areas = np.square(near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]])
-        return cls(areas, NeighbourhoodNoise.of(near, len(index)), between_walls(near, len(index)))
+        areas = near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]] ** 2
+        return cls(on_host(areas), NeighbourhoodNoise.of(near, patches), between_walls(near, patches))
 
 
-def _looked_at(xyz: Floats, patches: Patches) -> tuple[Floats, int, bool]:
-    """Return the points, of how many of a patch's the neighbours are looked at, and whether a patch is all of them."""
-    return xyz, max(_SAMPLES, _SAMPLES_OF_ALL // len(patches.index)), len(patches.index) == 1
-
-
-def _together(patches: Patches) -> Iterator[npt.NDArray[np.int32]]:
-    return (patches.index[first : first + _TOGETHER] for first in range(0, len(patches.index), _TOGETHER))
-
-
-def _nearest(xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> Nearest:
-    """Look up the nearest points of some of each patch, index (M, P), in their patch: as many of each."""
-    found = []
-    for points in xyz.take(index, axis=0):
-        inner = inner_points(points, whole=whole)
-        found.append(Nearest.of(inner[:: math.ceil(len(inner) / samples)], points, _NEIGHBOURS_LOOKED_UP))
-    return Nearest.joined(found)
-
-
-def _between_walls(xyz: Floats, samples: int, whole: bool, index: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
-    return between_walls(_nearest(xyz, samples, whole, index), len(index), uncovered=True)
+def _uncovered_walls(near: Nearest, patches: int) -> npt.NDArray[np.bool_]:
+    return between_walls(near, patches, uncovered=True)
 
 
 def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:

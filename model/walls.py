@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
 __all__ = ["between_walls", "has_walls", "share_between_walls"]
@@ -48,11 +49,11 @@ class _Heights:
     heights: (n, k); fit: those planes or quadrics; normals: (n, 3), the planes'.
     """
 
-    thick: npt.NDArray[np.bool_]
-    midway: npt.NDArray[np.int64]
-    heights: Floats
+    thick: Array
+    midway: Array
+    heights: Array
     fit: _LocalFit
-    normals: Floats
+    normals: Array
 
     @classmethod
     def of(cls, near: Neighbourhoods) -> _Heights:
@@ -60,16 +61,17 @@ class _Heights:
         along = near.along_axes()
         fit = _LocalFit.of(along, near.radii)
         heights = fit.residuals(along[:, :, 0])
-        stds = np.sqrt(np.square(heights).mean(axis=1))
-        midway = np.count_nonzero(np.abs(heights) < _MIDWAY_STDS * stds[:, None], axis=1)
+        xp = namespace(heights)
+        stds = xp.sqrt(xp.square(heights).mean(1))
+        midway = xp.count_nonzero(abs(heights) < _MIDWAY_STDS * stds[:, None], 1)
         return cls(stds > _THICK_RATIO * near.radii, midway, heights, fit, near.normals)
 
     def are_walls(self, few: float, patches: int = 1) -> npt.NDArray[np.bool_]:
         """Say it of each of some patches that the points are of, as many of each, patch after patch."""
         thick, midway = self.thick.reshape(patches, -1), self.midway.reshape(patches, -1)
-        share = (thick * midway).sum(axis=1) / np.maximum(1, thick.sum(axis=1) * self.heights.shape[1])
-        walls: npt.NDArray[np.bool_] = (share < few) & (thick.mean(axis=1) > 0.5)
-        return walls
+        count = thick.sum(1)
+        share = (thick * midway).sum(1) / (count * self.heights.shape[1]).clip(min=1)
+        return on_host((share < few) & (count / thick.shape[1] > 0.5))
 
     def share_left(self, step: Floats, few: float, full: float = _FULL_STEP_STDS, none: float = _NO_STEP_STDS) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together.
@@ -92,21 +94,22 @@ class _LocalFit:
     terms: (n, k, m), those of each neighbour; inverse: (n, m, m), of the normal equations.
     """
 
-    terms: Floats
-    inverse: Floats
+    terms: Array
+    inverse: Array
 
     @classmethod
-    def of(cls, along: Floats, radii: Floats) -> _LocalFit:
+    def of(cls, along: Array, radii: Array) -> _LocalFit:
         """Take quadrics where there are as many neighbours as _QUADRIC_FROM; along: (n, k, 3), as `along_axes` says."""
         terms = surface_terms(along / radii[:, None, None], bent=along.shape[1] >= _QUADRIC_FROM)
-        equations = terms.mT @ terms + 1e-9 * np.eye(terms.shape[2])  # points in a line leave some of them open
-        return cls(terms, np.linalg.inv(equations).astype(np.float64, copy=False))
+        equations = terms.mT @ terms
+        for term in range(terms.shape[2]):
+            equations[:, term, term] += 1e-9  # points in a line leave some of them open
+        return cls(terms, namespace(terms).linalg.inv(equations))
 
-    def residuals(self, values: Floats) -> Floats:
+    def residuals(self, values: Array) -> Array:
         """Return what the fits leave of values (n, k)."""
         fits = self.inverse @ (self.terms.mT @ values[:, :, None])
-        left: Floats = values - (self.terms @ fits)[:, :, 0]
-        return left
+        return values - (self.terms @ fits)[:, :, 0]
 
     def noise_about_walls(self, height: Floats) -> Floats:
         """Return the std (n,) of heights (n, k) about two walls of the same shape, each point on its own side."""

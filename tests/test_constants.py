@@ -38,8 +38,8 @@ NOT_TUNED = {
     "patches.py": {"_TREE_HEIGHT"},
     "restraint.py": {"_LINE_FREEDOM"},  # of a mean and a direction
     "run.py": {"_HEARD", "_MOVED", "_NOTHING"},
-    "spacing.py": {"_TOGETHER"},
     "spread.py": {"_CHUNKS", "_TINY"},
+    "survey.py": {"_TOGETHER"},
     "turns.py": {"_PSI"},  # a root that the paper gives
 }
 

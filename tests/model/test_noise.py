@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.noise import NoiseReader
 from straightpcf.model.normalize import HIGH_NOISE, CloudFrame, patch_scales
+from straightpcf.model.survey import survey
 from straightpcf.model.tiles import Tiling
 from tests.clouds import far_group, noisy, sphere, torus
 
@@ -28,8 +28,7 @@ class Says:
         noise = self.far if len(positions) < _POINTS else self.near
         return np.minimum(noise * scales / 0.02, 1.0)  # the default calibration
 
-    def mapper(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-        return map(function, items)
+    survey = staticmethod(survey)
 
 
 def tile(xyz: npt.NDArray[np.float64]) -> Tiling:

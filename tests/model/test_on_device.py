@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from straightpcf.model import device_patches
 from straightpcf.model import on_device as device_path
@@ -16,6 +17,7 @@ from straightpcf.model.device_patches import cut_patches_on
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import Capture, Graphs, OnDevice
+from straightpcf.model.outliers import isolated
 from straightpcf.model.spread import spread
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import TooLarge
@@ -73,6 +75,21 @@ def test_neighbours_of_a_patch_spread_points_as_neighbours_of_the_cloud_do(netwo
     apart = np.linalg.norm(moved - spread(ball, 1.0), axis=1)
     assert (apart < 1e-5).mean() > 0.99
     assert apart.mean() < 0.002 * np.linalg.norm(moved, axis=1).mean()
+
+
+@pytest.mark.parametrize("count", [700, 8000])  # one patch, several
+def test_points_in_the_air_are_found_among_their_patches_as_in_the_whole_cloud(
+    network: StraightPCF, count: int
+) -> None:
+    ball, air = sphere(count, 0), np.random.default_rng(0).uniform(-3, 3, (30, 3))
+    cloud = np.vstack([ball, air]) / 6
+    tiling = Tiling(cloud, split(cloud, 10_000), coverage=3, seed=0)
+    nearest = on_device(network).processor.nearest_others(cloud, tiling, 8)
+    assert nearest is not None
+    _, expected = cKDTree(cloud).query(cloud, k=np.arange(2, 10))
+    assert (nearest == expected).mean() > 0.99
+    np.testing.assert_array_equal(isolated(cloud, nearest=nearest), isolated(cloud))
+    assert isolated(cloud)[-30:].any()
 
 
 def test_a_shape_is_captured_when_it_comes_again_and_reads_fresh_inputs() -> None:

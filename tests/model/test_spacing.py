@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
-from straightpcf.model import spacing
+from straightpcf.model import survey
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
@@ -43,9 +45,23 @@ def test_how_many_patches_are_looked_at_at_once_changes_nothing(together: int, m
     rough = loud(torus(5000), 0.005)
     patches = cut_patches(rough, coverage=3.0, seed=0)
     first = Sampling.of(rough, patches, 0.02)
-    monkeypatch.setattr(spacing, "_TOGETHER", together)
+    monkeypatch.setattr(survey, "_TOGETHER", together)
     assert Sampling.of(rough, patches, 0.02) == first
     assert first.after_pass(rough, patches) == replace(first, uncovered=True)
+
+
+@pytest.mark.parametrize("count", [99, 900, 5000])
+@pytest.mark.parametrize("noise_std", [0.0, 0.005, 0.02])
+def test_a_device_sees_what_the_host_sees(count: int, noise_std: float) -> None:
+    """Of one patch and of several, even points and such as lie by chance, few loud ones and walls among them."""
+    walls = np.vstack([even_sphere(count), 0.98 * even_sphere(count)])
+    device = partial(survey.survey_on, torch.device("cpu"))
+    for cloud in (noisy(even_sphere(count), noise_std), loud(torus(count), noise_std), walls):
+        patches = cut_patches(cloud, coverage=3.0, seed=0)
+        seen, expected = (Sampling.of(cloud, patches, 0.02, **how) for how in ({"survey": device}, {}))
+        close = pytest.approx(expected.low_noise, abs=1e-6), pytest.approx(expected.noise_of_most, rel=1e-9)
+        assert seen == replace(expected, low_noise=close[0], noise_of_most=close[1])
+        assert seen.after_pass(cloud, patches, survey=device) == seen.after_pass(cloud, patches)
 
 
 def test_where_nothing_tells_points_are_taken_for_even() -> None:
