@@ -40,3 +40,7 @@ CREATE TABLE IF NOT EXISTS events (
   at REAL NOT NULL,
   PRIMARY KEY (job, seq)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS turns (
+  owner TEXT PRIMARY KEY,
+  at INTEGER NOT NULL                 -- counts the jobs that were taken from the queue: of this owner's last one
+) WITHOUT ROWID;

@@ -10,24 +10,13 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from straightpcf.points.errors import (
-    ERRORS_BY_CODE,
-    IdConflict,
-    IdempotencyConflict,
-    InternalError,
-    InvalidRequest,
-    NotFound,
-    StraightPCFError,
-)
-from straightpcf.points.options import DenoiseOptions
+from straightpcf.points.errors import IdConflict, IdempotencyConflict, InvalidRequest, NotFound, StraightPCFError
 from straightpcf.service.jobs.database import open_database, transaction
 from straightpcf.service.jobs.record import (
     FINISHED,
@@ -41,6 +30,8 @@ from straightpcf.service.jobs.record import (
     NewJob,
     ResultInfo,
 )
+from straightpcf.service.jobs.rows import event_of, record_of
+from straightpcf.service.jobs.turns import count_turn, next_row, positions
 
 __all__ = ["JobStore"]
 
@@ -51,7 +42,6 @@ _DETAIL = 1000  # characters of what a job failed of that are kept: what a file 
 _PASSING: tuple[EventKind, ...] = ("preview", "progress")
 Hold = Literal["held", "canceled", "lost"]
 _FENCES = 2**32  # of one row: those of rows are apart, so that no fence comes back with an id that is used again
-_PLAIN = ("id", "owner", "folder", "state", "name", "format", "bytes", "points", "attempts", "traceparent")
 
 
 class JobStore:
@@ -134,17 +124,14 @@ class JobStore:
         query = f"SELECT * FROM jobs WHERE {' AND '.join(where)} ORDER BY seq DESC LIMIT ?"
         rows = self._db.execute(query, [*values, limit + 1]).fetchall()
         more = len(rows) > limit
-        queue = self._queue(max((row["seq"] for row in rows if row["state"] == "queued"), default=0))
-        records = [self._record(row, queue) for row in rows[:limit]]
+        queued = positions(self._db, owner, [row["seq"] for row in rows if row["state"] == "queued"])
+        records = [record_of(row, queued.get(row["seq"])) for row in rows[:limit]]
         return records, str(rows[limit - 1]["seq"]) if more else None
 
     def events(self, id: str, after: int = 0) -> list[JobEvent]:
         """Return what happened behind event `after`."""
         query = "SELECT e.* FROM events e JOIN jobs j ON e.job = j.seq WHERE j.id = ? AND e.seq > ? ORDER BY e.seq"
-        return [
-            JobEvent(seq=row["seq"], kind=row["kind"], data=json.loads(row["data"]), at=_time(row["at"]))
-            for row in self._db.execute(query, (id, after))
-        ]
+        return [event_of(row) for row in self._db.execute(query, (id, after))]
 
     def request_cancel(self, id: str, folder: str, *, expires_in: float) -> None:
         """Cancel a queued job at once; mark one that is worked on, for its server to see; NotFound if it is another."""
@@ -177,15 +164,18 @@ class JobStore:
     # --- what the server that works on jobs asks for
 
     def claim(self, server: str, lease_seconds: float) -> Claim | None:
-        """Take the oldest queued job, or none."""
+        """Take the queued job whose turn it is, or none."""
         with self._transaction():
             row = self._db.execute(
                 f"UPDATE jobs SET state = 'starting', fence = MAX(fence + 1, seq * {_FENCES}), server = ?,"
                 " attempts = attempts + 1, lease_until = ?, started_at = IFNULL(started_at, ?), progress = 0"
-                " WHERE seq = (SELECT seq FROM jobs WHERE state = 'queued' ORDER BY seq LIMIT 1) RETURNING *",
-                (server, time.monotonic() + lease_seconds, time.time()),
+                " WHERE seq = ? RETURNING *",
+                (server, time.monotonic() + lease_seconds, time.time(), next_row(self._db)),
             ).fetchone()
-            return None if row is None else Claim(record=self._record(row), fence=row["fence"], deaths=row["deaths"])
+            if row is None:
+                return None
+            count_turn(self._db, row["owner"])
+            return Claim(record=record_of(row), fence=row["fence"], deaths=row["deaths"])
 
     def extend(self, held: Sequence[tuple[str, int]], lease_seconds: float) -> list[Hold]:
         """Renew leases, given as ids and fences; say of each whether it holds, "canceled" if its job should be."""
@@ -355,46 +345,10 @@ class JobStore:
             (kind, json.dumps(data, allow_nan=False), time.time(), id),
         )
 
-    def _queue(self, last: int) -> list[int]:
-        """Return what waits up to row `last`, in order."""
-        query = "SELECT seq FROM jobs WHERE state = 'queued' AND seq <= ? ORDER BY seq"
-        return [row["seq"] for row in self._db.execute(query, (last,))]
-
-    def _record(self, row: sqlite3.Row, queue: list[int] | None = None) -> JobRecord:
-        """Read a row; queue: of many rows, so that each does not count anew how many are before it."""
-        position = None
-        if row["state"] == "queued" and queue is not None:
-            position = bisect_left(queue, row["seq"])
-        elif row["state"] == "queued":
-            query = "SELECT COUNT(*) FROM jobs WHERE state = 'queued' AND seq < ?"
-            (position,) = self._db.execute(query, (row["seq"],)).fetchone()
-        result = None if row["result"] is None else json.loads(row["result"])
-        return JobRecord(
-            **{name: row[name] for name in _PLAIN},
-            progress=row["progress"],
-            position=position,
-            options=DenoiseOptions(**json.loads(row["options"])),
-            created_at=_time(row["created_at"]),
-            started_at=_time_or_none(row["started_at"]),
-            finished_at=_time_or_none(row["finished_at"]),
-            expires_at=_time_or_none(row["expires_at"]),
-            error=None if row["error"] is None else _error(json.loads(row["error"])),
-            result=None if result is None else ResultInfo(**{k: v for k, v in result.items() if k != "file"}),
-            report=None if row["report"] is None else json.loads(row["report"]),
-        )  # fmt: skip
-
-
-def _error(saved: dict[str, str]) -> StraightPCFError:
-    return ERRORS_BY_CODE.get(saved["code"], InternalError)(saved["detail"])
+    def _record(self, row: sqlite3.Row) -> JobRecord:
+        queued = positions(self._db, row["owner"], [row["seq"]] if row["state"] == "queued" else [])
+        return record_of(row, queued.get(row["seq"]))
 
 
 def _canceled(id: str) -> dict[str, str]:
     return {"code": "job_canceled", "detail": f"job {id} was canceled"}
-
-
-def _time(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, UTC)
-
-
-def _time_or_none(seconds: float | None) -> datetime | None:
-    return None if seconds is None else _time(seconds)

@@ -203,4 +203,29 @@ def test_a_page_of_jobs_says_where_each_stands_in_the_queue(tmp_path: Path) -> N
         store.claim("here", 15.0)
         page, _ = store.page(owner="", limit=10)
         assert [(job.id, job.position) for job in page] == [(job.id, store.get(job.id).position) for job in page]
-        assert [job.position for job in page] == [5, 4, 2, 1, None]
+        assert [job.position for job in page] == [5, 4, 3, 1, None]
+
+
+def test_a_key_of_many_jobs_delays_those_of_another_by_one_also_where_that_one_deletes_them(tmp_path: Path) -> None:
+    with closing(JobStore(tmp_path / "jobs.sqlite3")) as store:
+
+        def submit(*ids: str) -> None:
+            for id in ids:
+                store.create(replace(new_job(id, folder=id), owner=id[0]))
+
+        def taken() -> str:
+            waiting = [job for owner in "abc" for job in store.page(owner=owner, states=("queued",))[0]]
+            first = next(job.id for job in waiting if job.position == 0)
+            assert sorted(job.position or 0 for job in waiting) == list(range(len(waiting)))
+            claim = store.claim("here", 15.0)
+            assert claim is not None
+            assert claim.record.id == first
+            if first[0] == "b":
+                store.delete(first, first)
+            return first
+
+        submit("a1", "a2", "a3", "a4", "b1", "b2")
+        assert [taken(), taken()] == ["a1", "b1"]
+        submit("b3", "c1")
+        assert [taken() for _ in range(6)] == ["c1", "a2", "b2", "a3", "b3", "a4"]
+        assert store.claim("here", 15.0) is None
