@@ -18,6 +18,7 @@ from straightpcf.service.jobs.full_disk import DISK_TROUBLES
 from straightpcf.service.jobs.record import Claim, EventKind, ResultInfo
 from straightpcf.service.jobs.result_name import result_name
 from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.jobs.troubles import Troubles
 
 __all__ = ["JobRunner"]
 
@@ -26,6 +27,9 @@ LEASE_SECONDS = 15.0
 HEARTBEAT_SECONDS = 1.0
 POLL_SECONDS = 1.0  # for jobs that another server took in
 END_TRIES = 30  # to write down how a job ended, a POLL_SECONDS apart: what was computed is not computed again
+
+_NOT_TAKEN = "jobs cannot be taken or written down; leases will run out"
+_NOT_RENEWED = "the leases could not be renewed; another try follows"
 
 Reason = Literal["canceled", "shutdown", "lost"]
 
@@ -48,6 +52,7 @@ class JobRunner:
         self._backend, self._folders, self._call, self._notify = backend, folders, call, notify
         self._max_points, self._ttl = max_points, result_ttl_seconds
         self._running: set[_Running] = set()
+        self._troubles = Troubles()  # of all loops together: their disk is one
         self._work = asyncio.Event()
         self._loops: list[asyncio.Task[None]] = []
         self._stopping = False
@@ -90,7 +95,7 @@ class JobRunner:
             try:
                 await self._serve_one()
             except DISK_TROUBLES as fault:
-                logger.warning("jobs cannot be taken or written down; leases will run out: %r", fault)
+                self._troubles.say(_NOT_TAKEN, fault)
                 await asyncio.sleep(POLL_SECONDS)
             except Exception:
                 logger.exception("a job could not be written down; its lease will run out")
@@ -99,6 +104,7 @@ class JobRunner:
     async def _serve_one(self) -> None:
         self._work.clear()
         claim = await self._call(JobStore.claim, self._folders.server, LEASE_SECONDS)
+        self._troubles.over(_NOT_TAKEN)
         if claim is None:
             await self._wait_for_work()
             return
@@ -128,11 +134,12 @@ class JobRunner:
                 held = [(running.claim.record.id, running.claim.fence) for running in tended]
                 holds = await self._call(JobStore.extend, held, LEASE_SECONDS)
             except DISK_TROUBLES as fault:
-                logger.warning("the leases could not be renewed; another try follows: %r", fault)
+                self._troubles.say(_NOT_RENEWED, fault)
                 continue
             except Exception:
-                logger.exception("the leases could not be renewed; another try follows")
+                logger.exception(_NOT_RENEWED)
                 continue
+            self._troubles.over(_NOT_RENEWED)
             for running, hold in zip(tended, holds, strict=True):
                 if hold != "held":
                     running.begin_to_end(hold)  # waits for nothing: the leases of the others go on
@@ -169,13 +176,14 @@ class JobRunner:
         await asyncio.wait([running.task])
         if not running.task.cancelled() and isinstance(fault := running.task.exception(), OSError | sqlite3.Error):
             raise fault  # this server's trouble, and no end to write down
+        troubles = Troubles()
         for _ in range(END_TRIES):
             try:
                 await self._write_end(running)
             except DISK_TROUBLES as fault:
                 if self._stopping:
                     raise
-                logger.warning("job %s: its end could not be written down yet: %r", running.claim.record.id, fault)
+                troubles.say(f"job {running.claim.record.id}: its end could not be written down yet", fault)
                 await asyncio.sleep(POLL_SECONDS)
             else:
                 return
@@ -258,6 +266,7 @@ class _Log:
         self._call, self._notify = call, notify
         self._told: asyncio.Queue[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]] | None] = asyncio.Queue()
         self._progress, self._iteration = 0.0, 0
+        self._troubles = Troubles()
         self._writer = asyncio.create_task(self._write())
 
     def on_start(self, device: str) -> None:
@@ -289,7 +298,7 @@ class _Log:
             try:
                 await self._call(function, self._id, self._fence, *args, **kwargs)
             except Exception as fault:  # the disk may be full by now and have room at the job's end
-                logger.warning("job %s: what its worker told could not be written down: %r", self._id, fault)
+                self._troubles.say(f"job {self._id}: what its worker told could not be written down", fault)
             self._notify(self._id)
 
 

@@ -1,0 +1,50 @@
+"""A disk that is not there for hours: what a server says of it, and what it does all the same."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sqlite3
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from straightpcf.service.jobs import runner
+from straightpcf.service.jobs.folders import JobFolders
+from straightpcf.service.jobs.runner import JobRunner
+from tests.service.fakes import ObedientBackend
+
+
+def test_a_disk_that_is_gone_is_said_once_whatever_the_workers_and_again_only_when_that_changes(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "uvicorn.error")
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.001)
+    gone = OSError(5, "gone", "/data/jobs.sqlite3")
+    calls = iter([*[gone] * 20, *[sqlite3.OperationalError("database is locked")] * 20, *[None] * 4, *[gone] * 20])
+    backend, over = ObedientBackend(), asyncio.Event()
+    backend.go.set()
+    monkeypatch.setattr(backend, "slots", 3)
+
+    async def call(*args: Any, **kwargs: Any) -> None:
+        fault = next(calls, over)
+        if fault is over:
+            over.set()
+        elif fault is not None:
+            raise cast(Exception, fault)
+
+    async def scenario() -> None:
+        jobs = JobRunner(
+            backend, folders=cast(JobFolders, SimpleNamespace(server="here")), call=call, notify=lambda id: None,
+            max_points=1, result_ttl_seconds=1.0,
+        )  # fmt: skip
+        jobs.start()
+        async with asyncio.timeout(5):
+            await over.wait()
+        await jobs.stop(lambda: 0.0)
+
+    asyncio.run(scenario())
+    said = [record.getMessage().rpartition("leases will run out")[2] for record in caplog.records]
+    locked = ": OperationalError('database is locked')"
+    assert said == [f": {gone!r}", locked, "", f": {gone!r}", ""]
