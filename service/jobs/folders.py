@@ -124,16 +124,21 @@ class JobFolders:
             path = self._lock_path(server)
             if _is_locked(path):
                 continue  # it lives
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # it is dead all the same
+                path.unlink()
             if server in servers:
                 dead.append(server)
         return dead
 
-    def orphans(self) -> list[str]:
-        """Name job folders that are old enough to have been committed, and drop uploads that nobody finished."""
+    def drop_uploads(self) -> None:
+        """Remove uploads that nobody finished."""
         for upload in _old_in(self._incoming):
             if _UPLOAD.fullmatch(upload.name) and upload.is_file() and not _is_locked(upload):
-                upload.unlink(missing_ok=True)
+                with suppress(OSError):  # as of a job's files: one that cannot be removed keeps no other
+                    upload.unlink()
+
+    def orphans(self) -> list[str]:
+        """Name job folders that are old enough to have been committed."""
         return [folder.name for folder in _old_in(self._jobs) if _OURS.fullmatch(folder.name)]
 
     def _old_locks(self) -> list[str]:

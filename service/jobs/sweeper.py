@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection
 from pathlib import Path
 
 from straightpcf.points.errors import SpoolFull
@@ -12,6 +12,7 @@ from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.full_disk import DISK_TROUBLES, keep_reserve
 from straightpcf.service.jobs.runner import StoreCall
 from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.jobs.troubles import Troubles
 
 __all__ = ["Sweeper"]
 
@@ -29,11 +30,12 @@ class Sweeper:
     ) -> None:  # fmt: skip
         self._data_dir, self._folders, self._call, self._notify = data_dir, folders, call, notify
         self._result_ttl, self._row_ttl = result_ttl_seconds, row_ttl_seconds
+        self._troubles = Troubles()
         self._loop: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Sweep once, and then from time to time."""
-        await self._try()
+        await self.sweep()
         self._loop = asyncio.create_task(self._keep_sweeping())
 
     async def stop(self) -> None:
@@ -43,28 +45,51 @@ class Sweeper:
             await asyncio.wait([self._loop])
 
     async def sweep(self) -> None:
-        """Expire what is old, remove what nobody owns, take back what died: first what makes room."""
+        """Expire what is old, remove what nobody owns, take back what died: first what makes room.
+
+        What keeps a step from its end keeps none of the others from their beginning.
+        """
+        steps: dict[str, Callable[[], Awaitable[None]]] = {
+            "jobs that are over their time are kept": self._remove_expired,
+            "uploads that nobody finished are kept": self._drop_uploads,
+            "files that no job owns are kept": self._remove_orphans,
+            "jobs of servers that died are not taken back": self._recover,
+            f"nothing is reserved in {self._data_dir} for a full disk": self._keep_reserve,
+        }
+        for trouble, step in steps.items():
+            said = f"{trouble} until the next sweep of the job store"
+            try:
+                await step()
+            except DISK_TROUBLES as fault:
+                self._troubles.say(said, fault)
+            except Exception:
+                logger.exception(said)
+            else:
+                self._troubles.over(said)
+
+    async def _keep_sweeping(self) -> None:
+        while True:
+            await asyncio.sleep(SWEEP_SECONDS)
+            await self.sweep()
+
+    async def _remove_expired(self) -> None:
         await self._remove(await self._expire())
+
+    async def _drop_uploads(self) -> None:
+        await asyncio.to_thread(self._folders.drop_uploads)
+
+    async def _remove_orphans(self) -> None:
         await self._remove(await self._call(JobStore.unknown, await asyncio.to_thread(self._folders.orphans)))
+
+    async def _recover(self) -> None:
         servers = await self._call(JobStore.servers)
         dead = await asyncio.to_thread(self._folders.dead_servers, servers - {self._folders.server})
         for id in await self._call(JobStore.recover, dead, expires_in=self._result_ttl):
             logger.warning("nobody worked on job %s any more: a server died, or could not write", id)
             self._notify(id)
+
+    async def _keep_reserve(self) -> None:
         await asyncio.to_thread(keep_reserve, self._data_dir)
-
-    async def _keep_sweeping(self) -> None:
-        while True:
-            await asyncio.sleep(SWEEP_SECONDS)
-            await self._try()
-
-    async def _try(self) -> None:
-        try:
-            await self.sweep()
-        except DISK_TROUBLES as fault:
-            logger.warning("a sweep of the job store failed; another follows: %r", fault)
-        except Exception:
-            logger.exception("a sweep of the job store failed; another follows")
 
     async def _expire(self) -> list[str]:
         """Mark what is over its time; on a full disk its files make the room that this takes."""

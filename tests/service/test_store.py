@@ -93,6 +93,7 @@ def test_an_upload_that_nobody_finished_is_dropped_and_what_is_of_others_is_let_
             os.utime(path, (LONG_AGO, LONG_AGO))
         with folders.upload() as sending:  # slowly: longer than an upload that nobody owns is kept
             os.utime(sending, (0, 0))
+            folders.drop_uploads()
             assert folders.orphans() == [job]
             assert sending.exists()
         assert {path.name for path in incoming.iterdir()} == {"folder", "letter.txt"}

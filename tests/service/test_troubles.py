@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sqlite3
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,7 +13,10 @@ import pytest
 
 from straightpcf.service.jobs import runner
 from straightpcf.service.jobs.folders import JobFolders
+from straightpcf.service.jobs.full_disk import RESERVE
 from straightpcf.service.jobs.runner import JobRunner
+from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.jobs.sweeper import Sweeper
 from tests.service.fakes import ObedientBackend
 
 
@@ -48,3 +52,33 @@ def test_a_disk_that_is_gone_is_said_once_whatever_the_workers_and_again_only_wh
     said = [record.getMessage().rpartition("leases will run out")[2] for record in caplog.records]
     locked = ": OperationalError('database is locked')"
     assert said == [f": {gone!r}", locked, "", f": {gone!r}", ""]
+
+
+def test_what_keeps_a_step_of_a_sweep_from_its_end_keeps_none_of_the_others_from_their_beginning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recovered: list[str] = []
+
+    def fails(*_: object) -> Any:
+        raise OSError(5, "cannot be read")
+
+    async def call(function: Any, *args: Any, **kwargs: Any) -> Any:
+        return {JobStore.servers: lambda: {"dead"}, JobStore.recover: lambda: args[0]}.get(function, fails)()
+
+    async def scenario() -> None:
+        folders = SimpleNamespace(
+            server="here", drop_uploads=fails, orphans=lambda: ["folder"], dead_servers=lambda servers: sorted(servers)
+        )
+        sweeper = Sweeper(
+            tmp_path, folders=cast(JobFolders, folders), call=call, notify=recovered.append, result_ttl_seconds=1.0,
+            row_ttl_seconds=1.0,
+        )  # fmt: skip
+        for _ in range(2):
+            await sweeper.sweep()
+
+    asyncio.run(scenario())
+    assert recovered == ["dead", "dead"]
+    assert (tmp_path / RESERVE).exists()
+    troubles = [record.getMessage().partition(" until")[0] for record in caplog.records]
+    kept = ["jobs that are over their time", "uploads that nobody finished", "files that no job owns"]
+    assert [said for said in troubles if "are kept" in said] == [f"{what} are kept" for what in kept]
