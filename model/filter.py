@@ -22,7 +22,7 @@ from straightpcf.model.run import MIN_POINTS, DenoiseResult, FinishedPatch, Run
 from straightpcf.model.turns import turns
 from straightpcf.points.device import DEVICE_NAME
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions
-from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions
+from straightpcf.points.options import MIN_TILE_POINTS, DenoiseOptions, check_threads
 
 __all__ = [
     "DEFAULT_WEIGHTS",
@@ -114,10 +114,11 @@ class Filter:
         its noise, and in parts where that fills the patches (`NoiseReader`), and less than what the network asks for is
         made of steps that are more than the noise (`restraint`).
         tile_points: how many points are cut into patches at once: what memory a filter needs beside the cloud itself.
-        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS, one of threads, coverage, euler_steps and
-        full_evaluations is below 1, or one of these but coverage is no whole number.
+        Raises InvalidOptions where they are fewer than MIN_TILE_POINTS, threads are not in 1..MAX_THREADS, one of
+        coverage, euler_steps and full_evaluations is below 1, or one of all these but coverage is no whole number.
         """
-        counts = {"threads": threads, "euler_steps": euler_steps, "full_evaluations": full_evaluations}
+        check_threads(threads)
+        counts = {"euler_steps": euler_steps, "full_evaluations": full_evaluations}
         for name, count in {**counts, "tile_points": tile_points}.items():
             if not isinstance(count, Integral | None):
                 raise InvalidOptions(f"{name} is {count!r}; it must be a whole number")

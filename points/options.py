@@ -9,9 +9,10 @@ from typing import Literal, TypeVar
 
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["DECIMAL", "MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"]
+__all__ = ["DECIMAL", "MAX_ITERATIONS", "MAX_THREADS", "MIN_TILE_POINTS", "DenoiseOptions", "check_threads"]
 
 MAX_ITERATIONS = 10
+MAX_THREADS = 1024  # more than machines have CPUs; a thread is begun for each
 MIN_TILE_POINTS = 10_000  # half of it, the smallest tile, still has whole patches
 _ITERATIONS, _SEED, _STRENGTH = f'"auto" or 1..{MAX_ITERATIONS}', f"an integer in 0..{2**32 - 1}", "in 0..1"
 # Python reads more: 1_000, and the digits of every script.
@@ -64,6 +65,12 @@ class DenoiseOptions:
             strength=default.strength if strength is None else _number("strength", float, strength, _STRENGTH),
             normals=default.normals if normals is None else normals.strip().lower(),  # type: ignore[arg-type]
         )
+
+
+def check_threads(threads: int | None) -> None:
+    """Raise InvalidOptions where CPU threads are no whole number in 1..MAX_THREADS; None is one for each CPU."""
+    if threads is not None:
+        _whole("threads", threads, range(1, MAX_THREADS + 1), f"a whole number in 1..{MAX_THREADS}")
 
 
 def _whole(name: str, value: object, allowed: range, limit: str) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from straightpcf.points.errors import InvalidOptions
-from straightpcf.points.options import DECIMAL, MIN_TILE_POINTS
+from straightpcf.points.options import DECIMAL, MIN_TILE_POINTS, check_threads
 
 __all__ = ["ENVIRONMENT_PREFIX", "Settings"]
 
@@ -25,7 +25,7 @@ _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://([a-z0-9._-]+|\[[0-9a-f:.]+\])(:[0-9]
 _HOST = re.compile(r"[a-z0-9._-]*[a-z0-9_-]|[0-9a-f:.]*:[0-9a-f:.]*", re.ASCII)  # without a dot at its end
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
-    "max_sync_seconds", "upload_idle_seconds", "download_idle_seconds", "result_ttl_seconds", "threads",
+    "max_sync_seconds", "upload_idle_seconds", "download_idle_seconds", "result_ttl_seconds",
     "shutdown_seconds",
 )  # fmt: skip
 _SECONDS = (
@@ -110,6 +110,7 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise InvalidOptions(f"{name} is {value}; it must be above 0")
+        check_threads(self.threads)
         if self.tile_points is not None and self.tile_points < MIN_TILE_POINTS:
             raise InvalidOptions(f"tile_points is {self.tile_points}; it must be at least {MIN_TILE_POINTS}")
         for name in ("rate_per_minute", "min_free_bytes", "row_ttl_seconds"):

@@ -15,7 +15,14 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "straightpcf": ["__version__"],
     "straightpcf.points.cloud": ["NORMALS", "PointCloud", "as_positions"],
-    "straightpcf.points.options": ["DECIMAL", "MAX_ITERATIONS", "MIN_TILE_POINTS", "DenoiseOptions"],
+    "straightpcf.points.options": [
+        "DECIMAL",
+        "MAX_ITERATIONS",
+        "MAX_THREADS",
+        "MIN_TILE_POINTS",
+        "DenoiseOptions",
+        "check_threads",
+    ],
     "straightpcf.model.filter": [
         "DEFAULT_WEIGHTS",
         "MIN_POINTS",

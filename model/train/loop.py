@@ -28,6 +28,7 @@ from straightpcf.model.train.state import Average, load_state, read_network, sav
 from straightpcf.model.train.step import GraphedStep, HostStep, Step
 from straightpcf.model.train.team import NetworkLoss, Team
 from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.options import check_threads
 
 __all__ = ["STATE_FILE", "Stage", "TrainStep", "train"]
 
@@ -102,6 +103,7 @@ def train(
         raise InvalidOptions(f"{processes} processes cannot share batches on {place}: they do so on a CPU")
     if passed and stage != "cvm":
         raise InvalidOptions(f"clouds after passes are for stage 'cvm', not for {stage!r}")
+    check_threads(threads)
     archives = [data] if isinstance(data, Path) else list(data)
     if threads is not None:
         torch.set_num_threads(threads)

@@ -6,6 +6,8 @@ import copy
 import multiprocessing
 import os
 import pickle
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +18,10 @@ from straightpcf.model.cpus import usable_cpus
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normals import recompute_normals
+from straightpcf.model.train.loop import train
+from straightpcf.points.errors import InvalidOptions
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.service.settings import Settings
 from tests.clouds import noisy, sphere, torus
 
 
@@ -27,6 +32,17 @@ def test_a_process_that_is_held_to_some_cpus_has_those(monkeypatch: pytest.Monke
     network = StraightPCF(width=16, distance_width=16)
     assert Filter(network).threads == 3
     assert Filter(network, threads=2).threads == 2
+
+
+@pytest.mark.parametrize("threads", [-1, 0, 1.5, 1025, 99_999_999_999])
+def test_threads_are_in_1_to_1024(threads: float, tmp_path: Path) -> None:
+    said = re.escape(f"threads is {threads}; it must be a whole number in 1..1024")
+    with pytest.raises(InvalidOptions, match=said):
+        Filter(StraightPCF(width=16, distance_width=16), threads=threads)  # type: ignore[arg-type]
+    with pytest.raises(InvalidOptions, match=said):
+        Settings(threads=threads)  # type: ignore[arg-type]
+    with pytest.raises(InvalidOptions, match=said):
+        train("vm", data=tmp_path / "none.npz", run_dir=tmp_path, iterations=1, threads=threads)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("there", "usable"), [(8, 8), (None, 1)])
