@@ -54,12 +54,20 @@ def point_to_mesh_distance(denoised: Array, vertices: Array, faces: Array) -> fl
 
 
 def unit_sphere(xyz: Array) -> tuple[Floats, float]:
-    """Return the bounding box's centre, (3,), and the largest distance from it; xyz: (N, 3)."""
+    """Return the bounding box's centre, (3,), and the largest distance from it; xyz: (N, 3).
+
+    Raises ValueError where all points are equal, or so far apart that float64 holds no distance.
+    """
     xyz = np.asarray(xyz, dtype=np.float64)
-    centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    radius = float(np.linalg.norm(xyz - centre, axis=1).max())
+    centre = xyz.min(axis=0) / 2 + xyz.max(axis=0) / 2
+    offset = xyz - centre
+    _, power = np.frexp(np.abs(offset).max())  # squares of what is tiny or huge are 0 or infinite
+    with np.errstate(over="ignore"):
+        radius = float(np.ldexp(np.linalg.norm(np.ldexp(offset, -power), axis=1).max(), power))
     if radius == 0:
         raise ValueError("all points are equal: there is no unit sphere to measure in")
+    if radius == np.inf:
+        raise ValueError(f"the points are {np.abs(offset).max():g} from their centre: float64 holds no distance so far")
     return centre, radius
 
 

@@ -150,3 +150,19 @@ def test_a_face_that_names_no_vertex_is_refused() -> None:
 def test_equal_points_have_no_unit_sphere() -> None:
     with pytest.raises(ValueError, match="all points are equal"):
         chamfer_distance(np.zeros((2, 3)), np.ones((5, 3)))
+
+
+@pytest.mark.parametrize("scale", [2.0**-1030, 2.0**-664, 2.0**531, 2.0**1020])
+def test_a_cloud_of_any_size_is_measured_in_its_unit_sphere(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    clean = rng.integers(-(2**20), 2**20, (50, 3)) / 2**20  # so that nothing is rounded where it is subnormal
+    denoised = clean + rng.integers(-(2**10), 2**10, clean.shape) / 2**20
+    faces = np.arange(48).reshape(16, 3)
+    wanted = chamfer_distance(denoised, clean), point_to_mesh_distance(denoised, clean, faces)
+    scaled = denoised * scale, clean * scale
+    assert (chamfer_distance(*scaled), point_to_mesh_distance(*scaled, faces)) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_points_so_far_apart_that_float64_holds_no_distance_are_refused() -> None:
+    with pytest.raises(ValueError, match="float64 holds no distance"):
+        chamfer_distance(np.zeros((2, 3)), np.array([[1.7e308] * 3, [-1.7e308] * 3]))
