@@ -158,12 +158,8 @@ def needs(extra: str) -> Iterator[None]:
     """Name the extra that brings what an import inside misses, or cannot load."""
     try:
         yield
-    except ModuleNotFoundError as exc:
-        raise errors.MissingDependency(
-            f"{exc.name} is not installed; pip install 'straightpcf[{extra}]' brings it"
-        ) from exc
-    except ImportError as exc:  # a library that it wants is not here, or is of another version
-        raise errors.MissingDependency(f"what straightpcf[{extra}] brings cannot be loaded: {exc}") from exc
+    except ImportError as exc:
+        raise errors.MissingDependency.of(extra, exc) from exc
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import straightpcf
-from straightpcf.points.errors import StraightPCFError
+from straightpcf.points.errors import MissingDependency, StraightPCFError
 
 __all__ = ["examine"]
 
@@ -32,10 +32,8 @@ def examine() -> tuple[dict[str, Any], bool]:
     }
     try:
         findings |= _examine_model()
-    except ModuleNotFoundError as exc:
-        return findings | {"problem": f"{exc.name} is not installed; pip install 'straightpcf[model]'"}, False
     except ImportError as exc:
-        return findings | {"problem": f"what straightpcf[model] brings cannot be loaded: {exc}"}, False
+        return findings | {"problem": MissingDependency.of("model", exc).message}, False
     except StraightPCFError as exc:
         return findings | {"problem": f"[{exc.code}] {exc.message}"}, False
     except OSError as exc:

@@ -111,6 +111,13 @@ class MissingDependency(InvalidRequest):
 
     code = "missing_dependency"
 
+    @classmethod
+    def of(cls, extra: str, exc: ImportError) -> MissingDependency:
+        """Name the extra that brings what an import missed, or could not load: a library that it wants is not here."""
+        if isinstance(exc, ModuleNotFoundError):
+            return cls(f"{exc.name} is not installed; pip install 'straightpcf[{extra}]' brings it")
+        return cls(f"what straightpcf[{extra}] brings cannot be loaded: {exc}")
+
 
 class InvalidCloud(InvalidRequest):
     """Report a file or an array that is no usable cloud."""

@@ -101,8 +101,8 @@ class Denoised:
         """Return an open3d cloud: a copy of the one that was sent, if one was, at the new positions."""
         try:
             import open3d
-        except ModuleNotFoundError as exc:
-            raise MissingDependency("open3d is not installed; pip install 'straightpcf[open3d]' brings it") from exc
+        except ImportError as exc:
+            raise MissingDependency.of("open3d", exc) from exc
 
         cloud = open3d.geometry.PointCloud(self.source) if self.source is not None else open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(np.asarray(self.xyz, dtype=np.float64))

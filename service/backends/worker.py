@@ -141,7 +141,7 @@ def _load(spec: WorkerSpec) -> Filter:
     try:
         from straightpcf.model.filter import load_filter
     except ImportError as exc:  # another process would meet it, too
-        raise MissingDependency(f"what straightpcf[model] brings cannot be loaded: {exc}") from exc
+        raise MissingDependency.of("model", exc) from exc
     denoiser = load_filter(spec.weights, device=spec.device, threads=spec.threads, tile_points=spec.tile_points)
     count, options = WARM_UP_POINTS, DenoiseOptions()
     if denoiser.device != "cpu":  # between passes points are spread, which is compiled there, too
