@@ -108,6 +108,9 @@ def test_what_is_dropped_is_taken_or_explained(page: Any, scan: Path, tmp_path: 
     page.fill("#seed", "")
     _drop(page, "#seed", items=[{"mimeType": "text/plain", "data": "7"}])
     assert page.input_value("#seed") == "7"
+    page.fill("#seed", "1e3")
+    page.click("#submit")
+    assert page.inner_text("#error").strip().startswith("The seed is 1e3; it must be a whole number in 0..4294967295")
 
 
 def test_a_browser_that_keeps_nothing_for_a_page_denoises_all_the_same(page: Any, scan: Path) -> None:

@@ -54,14 +54,20 @@ export class Form {
     fill(parts.format, info.formats.map((format) => [format.name, format.name.toUpperCase()]));
   }
 
-  // What is wrong before anything is sent, or "".
+  // What is wrong before anything is sent, and in which part; or null.
   fault() {
-    if (!this.file) return "Choose a file first.";
-    if (this.file.size === 0) return `${this.file.name} is empty.`;
-    if (this.info && this.file.size > this.info.max_bytes) {
-      return `${this.file.name} has ${text.bytes(this.file.size)}; this server takes ${text.bytes(this.info.max_bytes)}.`;
+    const { file, seed } = this.parts;
+    const size = this.file?.size;
+    const most = this.info?.max_bytes ?? Infinity;
+    if (!this.file) return { line: "Choose a file first.", part: file };
+    if (size === 0) return { line: `${this.file.name} is empty.`, part: file };
+    if (size > most) {
+      return { line: `${this.file.name} has ${text.bytes(size)}; this server takes ${text.bytes(most)}.`, part: file };
     }
-    return "";
+    if (!/^[0-9]+$/.test(seed.value)) { // 1e3 is a number to browsers
+      return { line: `The seed is ${seed.value}; it must be a whole number in ${seed.min}..${seed.max}, in digits.`, part: seed };
+    }
+    return null;
   }
 
   query() {

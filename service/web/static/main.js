@@ -94,8 +94,8 @@ async function send() {
   keepApiKey(parts.key.value.trim());
   const fault = form.fault();
   if (fault) {
-    showProblem(new Problem({ code: "", detail: fault }));
-    parts.file.focus();
+    showProblem(new Problem({ code: "", detail: fault.line }));
+    fault.part.focus();
     return;
   }
   const { file } = form;
