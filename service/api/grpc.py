@@ -256,7 +256,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
 
     async def _receive(
         self, config: pb.JobConfig, requests: AsyncIterator[Any], caller: Caller, endpoint: str, id: str | None
-    ) -> tuple[JobRecord, bool, None]:
+    ) -> tuple[JobRecord, bool]:
         engine = self._engine
         options = DenoiseOptions(**plain_of(config.options))
         if config.format:
@@ -275,7 +275,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
                 endpoint=endpoint,
                 traceparent=caller.traceparent,
             )
-            return *await engine.submit(source, wanted), None
+            return await engine.submit(source, wanted)
 
     async def _progress(self, record: JobRecord) -> AsyncIterator[pb.Progress]:
         async for event in self._engine.events(record.id, owner=record.owner):

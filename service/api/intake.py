@@ -23,7 +23,9 @@ KNOWN_FIELDS = OPTION_FIELDS | {"format", "filename"}
 MAX_NAME_LENGTH = 120
 MAX_KEY_LENGTH = 255
 
-_T = TypeVar("_T")
+Fields = Mapping[str, str]
+# What an upload has made: the job, whether it is new and, of a form, every field that came with it.
+_Taken = TypeVar("_Taken", tuple[JobRecord, bool], tuple[JobRecord, bool, Fields])
 
 
 class Coming:
@@ -36,21 +38,20 @@ class Coming:
         self._engine = engine
         self._jobs: dict[object, tuple[str, str]] = {}  # owner and id, by upload
 
-    async def take(
-        self, owner: str, id: str | None, taking: Awaitable[tuple[JobRecord, bool, _T]]
-    ) -> tuple[JobRecord, bool, _T]:
+    async def take(self, owner: str, id: str | None, taking: Awaitable[_Taken]) -> _Taken:
         """Return what an upload makes; raises NotFound where its job is deleted meanwhile."""
         upload = object()
         if id is not None:
             self._jobs[upload] = (owner, id)
         try:
-            record, created, more = await taking
+            taken = await taking
+            record, created = taken[0], taken[1]
             if created and id is not None and upload not in self._jobs:
                 await self._engine.delete(record.id, owner=owner)
                 raise NotFound(f"job {record.id} was deleted while its file was on its way")
         finally:
             self._jobs.pop(upload, None)
-        return record, created, more
+        return taken
 
     async def delete(self, owner: str, id: str) -> None:
         """Delete a job, and let none of its uploads make it; raises NotFound where there is neither."""
@@ -66,7 +67,7 @@ class Coming:
 
 async def take_job(
     request: Request, owner: str, *, endpoint: str, id: str | None = None, more_fields: frozenset[str] = frozenset()
-) -> tuple[JobRecord, bool, Mapping[str, str]]:
+) -> tuple[JobRecord, bool, Fields]:
     """Receive the body and commit the job; return it, whether it is new, and every field that came with it.
 
     Raises NotFound where the job is deleted meanwhile.
@@ -77,7 +78,7 @@ async def take_job(
 
 async def _take(
     request: Request, owner: str, endpoint: str, id: str | None, more_fields: frozenset[str]
-) -> tuple[JobRecord, bool, Mapping[str, str]]:
+) -> tuple[JobRecord, bool, Fields]:
     engine: Engine = request.app.state.engine
     key = checked_key(request.headers.get("idempotency-key"))
     await engine.check_room(size=declared_size(request), owner=owner, id=id, idempotency_key=key)
