@@ -20,7 +20,7 @@ import numpy.typing as npt
 from straightpcf.model.filter import Filter, Run, load_filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.tiles import Tiling
-from straightpcf.model.train.archive import by_stem, opened, read_array, split_name, write_archive
+from straightpcf.model.train.archive import by_stem, fingerprint, opened, read_array, split_name, write_archive
 from straightpcf.model.train.command import archive_to_write, errors_in_one_line, noise_level, positive, seed_number
 from straightpcf.model.train.data import drawn_noise, held_out_shapes
 from straightpcf.model.train.state import read_network
@@ -46,26 +46,27 @@ def write_passed(
     named `<archive>/<shape>/<number>/xyz`, (N, 3) float32 in the frame in which the filter has it;
     `<archive>/<shape>/<number>/frame` is that one's centre and radius among the clean points. What is there so far is
     kept beside `path` now and then and where this is interrupted, and gone on with. Raises InvalidOptions where that is
-    of another recording, or two archives have one name, MalformedFile, OSError.
+    of another recording, of archives that were others by then, or two archives have one name, MalformedFile, OSError.
     """
     rng = np.random.default_rng(seed)
     by_stem(data)
     shapes = {archive: _training_clouds(archive) for archive in data}
     part = path.with_suffix(".part.npz")
     of = [seed, [archive.stem for archive in data], _digest(denoiser), list(levels)]
-    written = _gone_on_with(part, of, rng)
+    contents = [fingerprint(archive) for archive in data]
+    written = _gone_on_with(part, of, contents, rng)
     kept_at, state = time.monotonic(), rng.bit_generator.state
-    _keep(part, written, of, state)  # a folder that takes no file is found out before the work
+    _keep(part, written, of, state, contents)  # a folder that takes no file is found out before the work
     try:
         while len(written) < 2 * count:
             more = _recorded(denoiser, data, shapes, rng, levels, len(written) // 2)
             written, state = written | more, rng.bit_generator.state
             if time.monotonic() - kept_at > _KEPT_EVERY:
-                _keep(part, written, of, state)
+                _keep(part, written, of, state, contents)
                 kept_at = time.monotonic()
         write_archive(path, written)
     except BaseException:
-        _keep(part, written, of, state)
+        _keep(part, written, of, state, contents)
         raise
     part.unlink()
 
@@ -95,24 +96,32 @@ def _recorded(
     return written
 
 
-def _gone_on_with(part: Path, of: list[object], rng: np.random.Generator) -> dict[str, npt.NDArray[np.generic]]:
+def _gone_on_with(
+    part: Path, of: list[object], contents: list[int], rng: np.random.Generator
+) -> dict[str, npt.NDArray[np.generic]]:
     """Return what `_keep` kept of a recording of the same, with `rng` as it was then; nothing if there is none."""
     if not part.exists():
         return {}
     with opened(part) as file:
         if _PROGRESS not in file:
             raise MalformedFile(f"{part} is no part of a recording: it has no {_PROGRESS}")
-        theirs, state = json.loads(str(file[_PROGRESS]))
+        theirs, state, *theirs_had = json.loads(str(file[_PROGRESS]))  # older ones kept no contents
         if theirs != of:  # hours of work, perhaps
             raise InvalidOptions(
                 f"{part} is of another seed, other data, weights or noise: go on with those, or remove it"
+            )
+        if theirs_had not in ([], [contents]):
+            raise InvalidOptions(
+                f"{part} is of archives of these names that held other arrays: go on with those, or remove it"
             )
         rng.bit_generator.state = state
         return {name: file[name] for name in file.files if name != _PROGRESS}
 
 
-def _keep(part: Path, written: Mapping[str, npt.NDArray[np.generic]], of: list[object], state: object) -> None:
-    write_archive(part, {_PROGRESS: np.array(json.dumps([of, state])), **written})
+def _keep(
+    part: Path, written: Mapping[str, npt.NDArray[np.generic]], of: list[object], state: object, contents: list[int]
+) -> None:
+    write_archive(part, {_PROGRESS: np.array(json.dumps([of, state, contents])), **written})
 
 
 def _digest(denoiser: Filter) -> int:
