@@ -72,14 +72,8 @@ def test_a_recording_that_was_interrupted_goes_on_to_the_same_clouds(
     assert not path.exists()
     kept = path.with_suffix(".part.npz")
     assert len(np.load(kept).files) > 1
-    changed = tmp_path / data.name
-    with np.load(data) as file:
-        np.savez(changed, **{name: file[name] * np.float32(1.5) for name in file.files})
-    with pytest.raises(InvalidOptions, match=r"archives of these names that held other arrays"):
-        write_passed(path, denoiser, [changed], 4, seed=3)
     monkeypatch.setattr(record, "_recorded", begun)
-    (same := tmp_path / data.name).write_bytes(data.read_bytes())
-    write_passed(path, denoiser, [same], 4, seed=3)
+    write_passed(path, denoiser, [data], 4, seed=3)
     with np.load(path) as ours, np.load(passed) as once:
         assert ours.files == once.files
         assert all(np.array_equal(ours[name], once[name]) for name in once.files)

@@ -15,7 +15,7 @@ from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.patches import PATCH_SIZE
 from straightpcf.model.train import archive, chance, record, scanned, solids
-from straightpcf.model.train.archive import write_archive
+from straightpcf.model.train.archive import fingerprint, write_archive
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.passed import PassedClouds
 from straightpcf.model.train.record import write_passed
@@ -85,11 +85,14 @@ def test_a_part_of_another_recording_is_not_written_over(tmp_path: Path) -> None
     denoiser = Filter(StraightPCF(width=128, distance_width=128).eval(), threads=1, coverage=2)
     part = tmp_path / "out.part.npz"
     of_these = [0, ["data"], record._digest(denoiser), [0.02]]
-    record._keep(part, {"a": np.ones(3)}, of_these, {})
+    record._keep(part, {"a": np.ones(3)}, of_these, {}, [fingerprint(data)])
     before = part.read_bytes()
     for other in ({"seed": 1}, {"levels": [0.03]}):
         with pytest.raises(InvalidOptions, match=r"out\.part\.npz is of another seed, other data, weights or noise"):
             write_passed(tmp_path / "out.npz", denoiser, [data], 1, **{"levels": [0.02], **other})  # type: ignore[arg-type]
+    np.savez(data, **{f"s{n}/1000": 2 * sphere(1000) for n in range(6)})  # type: ignore[arg-type]
+    with pytest.raises(InvalidOptions, match=r"out\.part\.npz is of archives of these names that held other arrays"):
+        write_passed(tmp_path / "out.npz", denoiser, [data], 1, levels=[0.02])
     assert part.read_bytes() == before
     np.savez(part, a=np.ones(3))
     with pytest.raises(MalformedFile, match="is no part of a recording"):
