@@ -216,6 +216,11 @@ def test_a_torch_that_cannot_be_loaded_is_named_wherever_it_is_wanted(
     with pytest.raises(MissingDependency) as caught:  # which ends the server, as a device that is not here does
         worker._load(WorkerSpec(device="cpu", weights=None, threads=1))
     assert caught.value.message == said
+    monkeypatch.setitem(sys.modules, "torch", None)
+    done = CliRunner().invoke(app, ["doctor", "--json"])
+    assert json.loads(done.stdout)["problem"] == "torch is not installed; pip install 'straightpcf[model]' brings it"
+    with pytest.raises(MissingDependency, match="torch is not installed"):
+        worker._load(WorkerSpec(device="cpu", weights=None, threads=1))
 
 
 def test_doctor_looks_for_what_pyproject_asks_for() -> None:
