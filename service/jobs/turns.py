@@ -26,11 +26,12 @@ def next_row(db: sqlite3.Connection) -> int | None:
 
 
 def count_turn(db: sqlite3.Connection, owner: str) -> None:
-    """Let all others that wait go before this owner's next job."""
+    """Let all others that wait go before this owner's next job; where nobody else waits, there is nothing to write."""
     db.execute(
-        "INSERT INTO turns SELECT ?, 1 + IFNULL(MAX(at), 0) FROM turns WHERE true"
+        "INSERT INTO turns SELECT ?, 1 + IFNULL(MAX(at), 0) FROM turns"
+        " WHERE EXISTS (SELECT 1 FROM jobs WHERE state = 'queued' AND owner != ?)"
         " ON CONFLICT (owner) DO UPDATE SET at = excluded.at",
-        (owner,),
+        (owner, owner),
     )
 
 

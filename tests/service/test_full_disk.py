@@ -24,7 +24,7 @@ from tests.clouds import noisy, torus
 from tests.conftest import RunningServer, run_server
 from tests.waiting import wait_for
 
-DISK_BYTES = 2**21
+DISK_BYTES = 2**21 + 2**18
 ON_A_SMALL_DISK = ("unshare", "-rm", "sh", "-c", f'mount -t tmpfs -o size={DISK_BYTES} tmpfs "$0" && exec "$@"')
 
 
