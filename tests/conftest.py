@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import httpcore2
 import pytest
 
 START_SECONDS = 60.0
@@ -24,6 +26,8 @@ START_SECONDS = 60.0
 def pytest_configure() -> None:
     # Two processes share the cores (pyproject.toml): threads that torch adds to the filter's own would wait for them.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Every client reads the machine's certificates, whether it needs them or not: of many hundreds, once is enough.
+    httpcore2.default_ssl_context = functools.cache(httpcore2.default_ssl_context)
 
 
 @dataclass(frozen=True)

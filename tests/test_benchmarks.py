@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,27 +21,19 @@ from straightpcf.model.checkpoint import read_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
 from straightpcf.model.kernels import cpu
 from tests.clouds import sphere
-
-ROOT = Path(__file__).parent.parent
+from tests.warm import run_warm
 
 Refused = Callable[..., tuple[int, str]]
 
 
 def printed(name: str, *arguments: object) -> str:
     ended = _run(name, *arguments)
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
+    assert ended.returncode == 0, ended.stderr.decode()
+    return ended.stdout.decode()
 
 
-def _run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{name}", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def _run(name: str, *arguments: object) -> subprocess.CompletedProcess[bytes]:
+    return run_warm(f"benchmarks.{name}", *arguments, environment=os.environ)
 
 
 @pytest.fixture
@@ -209,7 +202,7 @@ def test_points_that_an_archive_lacks_are_named_in_one_line(tmp_path: Path) -> N
     for points in (("--resolution", 700), ("--random", "--resolution", 60_000)):
         ended = _run("held_out", DEFAULT_WEIGHTS, "--data", tmp_path / "trained.npz", *points)
         assert ended.returncode == 1
-        (line,) = ended.stderr.splitlines()
+        (line,) = ended.stderr.decode().splitlines()
         assert f"f/{points[-1]}" in line
 
 

@@ -31,11 +31,17 @@ from straightpcf.service.backends import worker
 from straightpcf.service.backends.worker import WorkerSpec
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import clean_environment
+from tests.warm import run_warm
 
 POINTS = 400
 
 
 def cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    done = run_warm("straightpcf.clients.cli", *arguments, environment=clean_environment())
+    return subprocess.CompletedProcess(done.args, done.returncode, done.stdout.decode(), done.stderr.decode())
+
+
+def cold_cli(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, env=clean_environment(), timeout=120)
 
@@ -129,7 +135,7 @@ def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> N
 
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
-    done = cli("serve", "--port", "0", "--device", "cuda", "--data-dir", tmp_path)
+    done = cold_cli("serve", "--port", "0", "--device", "cuda", "--data-dir", tmp_path)
     assert done.returncode == 4
     assert "error [device_unavailable]" in done.stderr
     assert "Traceback" not in done.stderr
@@ -138,7 +144,7 @@ def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> N
 
 def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
     (taken := tmp_path / "file").write_bytes(b"")  # no folder: the server ends as soon as it has warned
-    done = cli("serve", "--host", "0.0.0.0", "--port", "0", "--data-dir", taken / "data")
+    done = cold_cli("serve", "--host", "0.0.0.0", "--port", "0", "--data-dir", taken / "data")
     assert "NO API KEYS ARE SET and this server listens on 0.0.0.0" in done.stderr
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     assert "data_dir" in done.stderr.splitlines()[-1]
@@ -148,7 +154,7 @@ def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
 def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-        done = cli("serve", "--port", "0", option, str(port), "--device", "cpu", "--data-dir", tmp_path)
+        done = cold_cli("serve", "--port", "0", option, str(port), "--device", "cpu", "--data-dir", tmp_path)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith(f"error [invalid_options]: {option[2:].replace('-', '_')} is {port}")
     assert "Started server process" not in done.stderr
@@ -156,7 +162,7 @@ def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str
 
 @pytest.mark.parametrize("host", ["no.such.host", "192.0.2.1", ".."])  # no name, another machine's, none at all
 def test_serve_says_that_its_host_is_none_of_this_machine_before_it_starts_anything(host: str, tmp_path: Path) -> None:
-    done = cli("serve", "--host", host, "--port", "0", "--grpc-port", "0", "--data-dir", tmp_path)
+    done = cold_cli("serve", "--host", host, "--port", "0", "--grpc-port", "0", "--data-dir", tmp_path)
     assert done.returncode == 2
     assert f"host is {host!r}, where this machine cannot listen: " in done.stderr.replace("\n", "")
     assert "Started server process" not in done.stderr
@@ -174,7 +180,7 @@ def test_info_describes_a_file(scan: Path) -> None:
 
 
 def test_version_starts_without_torch_or_a_server() -> None:
-    done = cli("version")
+    done = cold_cli("version")
     assert done.stdout.strip() == straightpcf.__version__
     code = "import sys, straightpcf.clients.cli; print({'torch', 'fastapi', 'numpy', 'httpx2'} & set(sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

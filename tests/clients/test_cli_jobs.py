@@ -17,14 +17,15 @@ import pytest
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, clean_environment
 from tests.waiting import wait_for
+from tests.warm import MODEL, SDK, run_warm
 
 POINTS = 400
 
 
 def cli(server: RunningServer | None, *arguments: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
-    command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
     environment = clean_environment() | ({} if server is None else {"STRAIGHTPCF_URL": server.url})
-    return subprocess.run(command, capture_output=True, check=False, env=environment, timeout=120, input=stdin)
+    loaded = MODEL if {"denoise", "watch"} & {*arguments} and "--url" not in arguments else SDK
+    return run_warm("straightpcf.clients.cli", *arguments, environment=environment, stdin=stdin, loaded=loaded)
 
 
 @pytest.fixture
