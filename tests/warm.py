@@ -116,4 +116,4 @@ if __name__ == "__main__":
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as connection:
         module = _become_what_is_asked_for(connection)
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    runpy._run_module_as_main(module)  # what `python -m` calls: multiprocessing finds this module by two names

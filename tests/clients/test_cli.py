@@ -242,7 +242,8 @@ def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None
     data, run = tmp_path / "shapes.npz", tmp_path / "run"
     np.savez(data, **{f"shape{i:02d}/1500": torus(1500, i).astype(np.float32) for i in range(11)})
     for iterations, said in (("1", ""), ("2", ""), ("1", f"nothing to do: {run} is at iteration 1 or beyond\n")):
-        done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", iterations, "--batch-size", "2")
+        options = ("--iterations", iterations, "--batch-size", "2", "--rows", "16")
+        done = cli("train", "vm", "--data", data, "--run-dir", run, *options)
         assert (done.returncode, done.stderr) == (0, said)
     rows = (run / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["vm", "1"], ["vm", "2"]]
@@ -306,7 +307,9 @@ def test_a_log_that_finds_no_room_is_told_with_the_place(tmp_path: Path) -> None
     np.savez(data := tmp_path / "shapes.npz", **{f"{name}/1500": torus(1500) for name in "abcdef"})  # type: ignore[arg-type]
     (run := tmp_path / "run").mkdir()
     (run / "log.csv").symlink_to("/dev/full")
-    done = cli("train", "vm", "--data", data, "--run-dir", run, "--iterations", "1", "--batch-size", "1")
+    done = cli(
+        "train", "vm", "--data", data, "--run-dir", run, "--iterations", "1", "--batch-size", "1", "--rows", "16"
+    )
     assert done.returncode == 3
     assert done.stderr == f"error [invalid_request]: [Errno 28] No space left on device: '{run}'\n"
 
