@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime
 
 from straightpcf.model.train.bodies import Body, Limb, carving, creature
+from tests.model.numeric import numeric_gradient
 
 STILL = (np.zeros((1, 3)), np.zeros(1), np.zeros(1))  # no relief
 UP = np.array([0.0, 0.0, 1.0])
@@ -46,7 +46,7 @@ def test_the_gradient_is_that_of_the_value(family: Callable[[np.random.Generator
     xyz, normals = body.sample(np.random.default_rng(1), 500)
     value, gradient = body.value(xyz)
     assert np.abs(value).max() < 1e-8
-    numeric = np.stack([approx_fprime(point, lambda x: float(body.value(x[None])[0][0]), 1e-7) for point in xyz])
+    numeric = numeric_gradient(lambda points: body.value(points)[0], xyz)
     # Limbs have creases of their own, at the seam to their round ends; no more than a few points lie there.
     assert np.median(np.linalg.norm(gradient - numeric, axis=1)) < 1e-5
     assert (np.linalg.norm(gradient - numeric, axis=1) < 1e-3).mean() > 0.98
