@@ -27,7 +27,7 @@ from straightpcf.points.errors import InvalidOptions, MalformedFile
 
 @pytest.fixture(scope="module")
 def velocity_run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train("vm", data=data, run_dir=tmp_path_factory.mktemp("vm"), iterations=3, batch_size=2, threads=1)
+    return train("vm", data=data, run_dir=tmp_path_factory.mktemp("vm"), iterations=3, batch_size=2, threads=1, rows=32)
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -100,22 +100,22 @@ def test_a_stage_runs_as_a_cuda_graph(data: Path, tmp_path: Path, velocity_run: 
 
 
 def test_the_same_seed_gives_the_same_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:
-    again = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1)
+    again = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1, rows=32)
     assert same(weights(again), weights(velocity_run))
 
 
 def test_a_later_stage_asks_for_the_one_before(data: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidOptions, match="init"):
-        train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1)
+        train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1, rows=32)
 
 
 def test_the_stages_follow_each_other_and_freeze_what_they_should(
     data: Path, tmp_path: Path, velocity_run: Path
 ) -> None:
     coupled = train(
-        "cvm", data=data, run_dir=tmp_path / "cvm", iterations=2, batch_size=2, threads=1, init=velocity_run
+        "cvm", data=data, run_dir=tmp_path / "cvm", iterations=2, batch_size=2, threads=1, rows=32, init=velocity_run
     )
-    full = train("dm", data=data, run_dir=tmp_path / "dm", iterations=2, batch_size=2, threads=1, init=coupled)
+    full = train("dm", data=data, run_dir=tmp_path / "dm", iterations=2, batch_size=2, threads=1, rows=32, init=coupled)
     before, after = weights(coupled), weights(full)
     moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert moved == {"distance_module"}
@@ -124,7 +124,7 @@ def test_the_stages_follow_each_other_and_freeze_what_they_should(
 def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> None:
     seen: list[int] = []
     for iterations in (2, 4):
-        train("vm", data=data, run_dir=tmp_path, iterations=iterations, batch_size=2, threads=1,
+        train("vm", data=data, run_dir=tmp_path, iterations=iterations, batch_size=2, threads=1, rows=32,
               on_step=lambda step: seen.append(step.iteration))  # fmt: skip
     assert seen == [1, 2, 3, 4]
     assert (tmp_path / "log.csv").read_text().count("stage") == 1
@@ -137,19 +137,19 @@ def test_what_an_interruption_lost_stands_in_the_log_once(data: Path, tmp_path: 
     (tmp_path / "log.csv").write_text(
         "stage,iteration\nvm,50,1,,1,1\n"
     )  # of a run that was ended before its first state
-    train("vm", data=data, run_dir=tmp_path, iterations=2, batch_size=2, threads=1)
+    train("vm", data=data, run_dir=tmp_path, iterations=2, batch_size=2, threads=1, rows=32)
     assert iterations() == ["iteration", "2"]
     with (tmp_path / "log.csv").open("a") as log:
         log.write("vm,50,1.0,,0.001,1.0\r\nvm,10")  # and then within a line
-    train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1)
+    train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1, rows=32)
     assert iterations() == ["iteration", "2", "3"]
 
 
 def test_an_interrupted_run_ends_with_the_weights_of_an_uninterrupted_one(data: Path, tmp_path: Path) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
-    train("vm", data=data, run_dir=once, iterations=12, batch_size=1, threads=1)
-    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1, minutes=0.0)
-    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1)
+    train("vm", data=data, run_dir=once, iterations=12, batch_size=1, threads=1, rows=32)
+    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1, rows=32, minutes=0.0)
+    train("vm", data=data, run_dir=twice, iterations=12, batch_size=1, threads=1, rows=32)
     assert same(weights(once / "state.safetensors"), weights(twice / "state.safetensors"))
 
 
@@ -167,7 +167,7 @@ def test_a_shared_run_is_the_same_again_and_where_it_was_interrupted(data: Path,
 
 
 def test_a_directory_in_which_a_run_is_at_work_is_no_other_ones(data: Path, tmp_path: Path) -> None:
-    wanted = partial(train, "vm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1)
+    wanted = partial(train, "vm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1, rows=32)
     refused: list[str] = []
 
     def another_one(_: TrainStep) -> None:
@@ -184,7 +184,7 @@ def test_a_directory_in_which_a_run_is_at_work_is_no_other_ones(data: Path, tmp_
 
 
 def test_a_run_of_another_stage_or_stack_is_not_gone_on_with(data: Path, tmp_path: Path, velocity_run: Path) -> None:
-    run = partial(train, data=data, run_dir=tmp_path, iterations=1, batch_size=1, threads=1, init=velocity_run)
+    run = partial(train, data=data, run_dir=tmp_path, iterations=1, batch_size=1, threads=1, rows=32, init=velocity_run)
     run("cvm")
     for stage, couplings in (("dm", 2), ("cvm", 3), ("vm", 2)):
         with pytest.raises(InvalidOptions, match="takes another directory"):
@@ -195,7 +195,15 @@ def test_a_settled_run_keeps_the_statistics_and_can_start_from_its_own_stage(
     data: Path, tmp_path: Path, velocity_run: Path
 ) -> None:
     path = train(
-        "vm", data=data, run_dir=tmp_path, iterations=2, batch_size=2, threads=1, init=velocity_run, settled=True
+        "vm",
+        data=data,
+        run_dir=tmp_path,
+        iterations=2,
+        batch_size=2,
+        threads=1,
+        rows=32,
+        init=velocity_run,
+        settled=True,
     )
     before, after = weights(velocity_run), weights(path)
     moved = {name.rsplit(".", 1)[1] for name in before if not torch.equal(before[name], after[name])}
@@ -203,8 +211,8 @@ def test_a_settled_run_keeps_the_statistics_and_can_start_from_its_own_stage(
 
 
 def test_a_run_starts_from_weights_that_ship_and_takes_their_distance_module(data: Path, tmp_path: Path) -> None:
-    path = train("cvm", data=data, run_dir=tmp_path, iterations=2, batch_size=1, threads=1, init=DEFAULT_WEIGHTS,
-                 distance=DEFAULT_WEIGHTS, settled=True)  # fmt: skip
+    path = train("cvm", data=data, run_dir=tmp_path, iterations=2, batch_size=1, threads=1, rows=32,
+                 init=DEFAULT_WEIGHTS, distance=DEFAULT_WEIGHTS, settled=True)  # fmt: skip
     before, after = load_checkpoint(DEFAULT_WEIGHTS).state_dict(), weights(path)
     moved = {name for name in before if not torch.equal(before[name], after[name])}
     assert moved
@@ -226,8 +234,8 @@ def test_a_run_that_starts_from_weights_that_ship_rounds_as_the_one_that_goes_on
 
 def test_the_distance_module_may_come_from_another_state(data: Path, tmp_path: Path, velocity_run: Path) -> None:
     def run(stage: Stage, name: str, init: Path, distance: Path | None = None) -> Path:
-        return train(stage, data=data, run_dir=tmp_path / name, iterations=1, batch_size=1, threads=1, init=init,
-                     distance=distance)  # fmt: skip
+        return train(stage, data=data, run_dir=tmp_path / name, iterations=1, batch_size=1, threads=1, rows=32,
+                     init=init, distance=distance)  # fmt: skip
 
     coupled = run("cvm", "cvm", velocity_run)
     other = run("dm", "dm", coupled)
@@ -250,8 +258,8 @@ def test_the_mean_of_two_states_is_taken_weight_for_weight(velocity_run: Path) -
 
 def test_processes_share_a_batch_and_the_weights(data: Path, tmp_path: Path, velocity_run: Path) -> None:
     losses: list[float] = []
-    path = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=4, threads=1, processes=2, settled=True,
-                 init=velocity_run, on_step=lambda step: losses.append(step.loss))  # fmt: skip
+    path = train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=4, threads=1, rows=32, processes=2,
+                 settled=True, init=velocity_run, on_step=lambda step: losses.append(step.loss))  # fmt: skip
     assert len(losses) == 3
     assert all(np.isfinite(losses))
     before, after = weights(velocity_run), weights(path)
@@ -312,7 +320,9 @@ def test_a_run_that_fails_ends_the_processes_that_share_its_batches(data: Path, 
         raise OSError("no space left")
 
     with pytest.raises(OSError, match="no space"):
-        train("vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1, processes=2, on_step=fail)
+        train(
+            "vm", data=data, run_dir=tmp_path, iterations=3, batch_size=2, threads=1, rows=32, processes=2, on_step=fail
+        )
     for process in multiprocessing.active_children():
         process.join(timeout=30)
     assert not multiprocessing.active_children()
@@ -338,7 +348,7 @@ def test_a_state_that_the_disk_has_no_room_for_is_a_files_error_and_the_old_one_
 
 
 def test_a_run_with_its_minutes_used_up_stops_with_its_state_saved(data: Path, tmp_path: Path) -> None:
-    path = train("vm", data=data, run_dir=tmp_path, iterations=100, batch_size=2, threads=1, minutes=0.0)
+    path = train("vm", data=data, run_dir=tmp_path, iterations=100, batch_size=2, threads=1, rows=32, minutes=0.0)
     assert read_network(path)[1]["iteration"] == 1
 
 
@@ -374,7 +384,7 @@ def test_a_run_that_diverges_says_what_to_do_and_keeps_its_last_good_state(
 
     monkeypatch.setattr(loop, "HostStep", Diverging)
     with pytest.raises(InvalidOptions, match=rf"{what}: .* has iteration 2, .* a lower learning rate than 0\.001"):
-        train("vm", data=data, run_dir=tmp_path, iterations=6, batch_size=1, threads=1)
+        train("vm", data=data, run_dir=tmp_path, iterations=6, batch_size=1, threads=1, rows=32)
     state = tmp_path / loop.STATE_FILE
     assert read_network(state)[1]["iteration"] == 2
     assert all(bool(tensor.isfinite().all()) for tensor in weights(state).values())
