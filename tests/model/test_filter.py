@@ -331,7 +331,7 @@ def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
     tiny: Filter, monkeypatch: pytest.MonkeyPatch, parts: tuple[int, ...]
 ) -> None:
     monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_: parts)
-    cloud = noisy(torus(22_000), 0.01)
+    cloud = noisy(torus(11_000), 0.01)
     options = DenoiseOptions(iterations=1)
     results = [
         Filter(tiny.network, threads=threads, coverage=2, tile_points=10_000).denoise(cloud, options)
