@@ -27,7 +27,10 @@ def pytest_configure() -> None:
     # Two processes share the cores (pyproject.toml): threads that torch adds to the filter's own would wait for them.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Every client reads the machine's certificates, whether it needs them or not: of many hundreds, once is enough.
-    httpcore2.default_ssl_context = functools.cache(httpcore2.default_ssl_context)
+    make = httpcore2.default_ssl_context
+    read = functools.cache(lambda _, **options: make(**options))
+    files = "SSL_CERT_FILE", "SSL_CERT_DIR"
+    httpcore2.default_ssl_context = lambda **options: read(tuple(map(os.environ.get, files)), **options)
 
 
 @dataclass(frozen=True)
