@@ -131,11 +131,16 @@ class JobFolders:
         return dead
 
     def drop_uploads(self) -> None:
-        """Remove uploads that nobody finished."""
+        """Remove uploads that nobody finished; raises OSError of one that stays once the others are gone."""
+        fault: OSError | None = None
         for upload in _old_in(self._incoming):
             if _UPLOAD.fullmatch(upload.name) and upload.is_file() and not _is_locked(upload):
-                with suppress(OSError):  # as of a job's files: one that cannot be removed keeps no other
-                    upload.unlink()
+                try:
+                    upload.unlink(missing_ok=True)
+                except OSError as exc:
+                    fault = exc
+        if fault is not None:
+            raise fault
 
     def orphans(self) -> list[str]:
         """Name job folders that are old enough to have been committed."""
