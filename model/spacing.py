@@ -64,8 +64,8 @@ class Sampling:
         noise = [s.noise for s in found]
         noise_of_most = _noise_of_most(noise, noise_std)
         noise_std = min(noise_std, noise_of_most)
-        irregular = patches.index.shape[1] >= _LEAST_PATCH_POINTS
-        irregular = irregular and _is_irregular(areas, noise_std, thin_walls=thin_walls)
+        enough = patches.index.shape[1] >= _LEAST_PATCH_POINTS
+        irregular = enough and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
         return cls(irregular, low_noise, thin_walls, noise_of_most=noise_of_most)
 
