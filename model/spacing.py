@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from straightpcf.model.arrays import on_host
 from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
@@ -13,7 +12,7 @@ from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats
 from straightpcf.model.survey import Survey, survey
-from straightpcf.model.walls import between_walls, has_walls
+from straightpcf.model.walls import has_walls, may_hide_walls, midway_shares
 
 __all__ = ["Sampling"]
 
@@ -40,13 +39,15 @@ class Sampling:
 
     irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
-    uncovered: whether that was asked again once a pass had taken most of the noise; noise_of_most: the noise std of
-    most points, where a few have so much more that theirs is what is read of all, else infinite.
+    hides_walls: whether noise may hide such; uncovered: whether these were looked for once a pass had taken most of it;
+    noise_of_most: the noise std of most points, where a few have so much more that theirs is what is read of all, else
+    infinite.
     """
 
     irregular: bool = False
     low_noise: float = 0.0
     thin_walls: bool = False
+    hides_walls: bool = False
     uncovered: bool = False
     noise_of_most: float = np.inf
 
@@ -59,7 +60,8 @@ class Sampling:
     def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, survey: Survey = survey) -> Sampling:
         """Look at an object's points (N, 3), with noise of some std, in some of its patches."""
         found = list(survey(xyz, patches, _PatchStatistics.of))
-        thin_walls = has_walls([s.between_walls for s in found])
+        shares = np.concatenate([s.midway_shares for s in found])
+        thin_walls = has_walls(shares)
         areas = np.concatenate([s.areas for s in found])
         noise = [s.noise for s in found]
         noise_of_most = _noise_of_most(noise, noise_std)
@@ -67,11 +69,13 @@ class Sampling:
         enough = patches.index.shape[1] >= _LEAST_PATCH_POINTS
         irregular = enough and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
-        return cls(irregular, low_noise, thin_walls, noise_of_most=noise_of_most)
+        return cls(irregular, low_noise, thin_walls, hides_walls=may_hide_walls(shares), noise_of_most=noise_of_most)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, survey: Survey = survey) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
-        thin_walls = self.thin_walls or has_walls(list(survey(xyz, patches, _uncovered_walls)))
+        thin_walls = self.thin_walls
+        if self.hides_walls and not thin_walls:
+            thin_walls = has_walls(np.concatenate(list(survey(xyz, patches, midway_shares))), uncovered=True)
         return replace(self, thin_walls=thin_walls, uncovered=True)
 
 
@@ -79,23 +83,20 @@ class Sampling:
 class _PatchStatistics:
     """What points of some patches have around them, n in all.
 
-    areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; between_walls: as of `between_walls`.
+    areas: (n, 3), squared distances to the nearest other, the 8th and the 32nd; midway_shares: (M, 2), as of
+    `midway_shares`.
     """
 
     areas: Floats
     noise: NeighbourhoodNoise
-    between_walls: npt.NDArray[np.bool_]
+    midway_shares: Floats
 
     @classmethod
     def of(cls, near: Nearest, patches: int) -> _PatchStatistics:
         """Look at the nearest points of some, as many of each patch, patch after patch."""
         last = near.distances.shape[1] - 1
         areas = near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]] ** 2
-        return cls(on_host(areas), NeighbourhoodNoise.of(near, patches), between_walls(near, patches))
-
-
-def _uncovered_walls(near: Nearest, patches: int) -> npt.NDArray[np.bool_]:
-    return between_walls(near, patches, uncovered=True)
+        return cls(on_host(areas), NeighbourhoodNoise.of(near, patches), midway_shares(near, patches))
 
 
 def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:

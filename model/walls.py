@@ -6,7 +6,6 @@ nothing moves (docs/filter.md, "Two walls or one").
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["between_walls", "has_walls", "share_between_walls"]
+__all__ = ["has_walls", "may_hide_walls", "midway_shares", "share_between_walls"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -31,6 +30,9 @@ _WALLS_MIDWAY_SHARE, _MAYBE_WALLS_MIDWAY_SHARE = 0.27, 0.28
 _WALL_PATCHES_SHARE = 0.2
 # Where a pass has taken the noise of one surface, what still has height has walls: more neighbours may lie midway.
 _UNCOVERED_MIDWAY_SHARE = 0.33
+# A pass may leave one surface, a flat sheet, in two layers, which look so, too. Before it of the nearest 64 of a sheet
+# 0.37 were midway in all but a fifth of the patches, of walls that noise hides 0.30 to 0.354.
+_HIDDEN_MIDWAY_SHARE = 0.36
 _THICK_RATIO = 0.1  # of the neighbourhood's radius, the std of the heights: what is thinner is one surface with an edge
 # Moves across, in stds of the points about the wall that each is on: up to the first all is made of them, from the
 # second on nothing. What the network tells apart it moves by 0.4 to 1.0 of that, what it joins or blurs by 1.2 to 1.8.
@@ -66,12 +68,15 @@ class _Heights:
         midway = xp.count_nonzero(abs(heights) < _MIDWAY_STDS * stds[:, None], 1)
         return cls(stds > _THICK_RATIO * near.radii, midway, heights, fit, near.normals)
 
-    def are_walls(self, few: float, patches: int = 1) -> npt.NDArray[np.bool_]:
-        """Say it of each of some patches that the points are of, as many of each, patch after patch."""
+    def midway_shares(self, patches: int = 1) -> Floats:
+        """Return it of each of some patches that the points are of, as many of each, patch after patch: (patches,).
+
+        1 where most points have no more height than an edge.
+        """
         thick, midway = self.thick.reshape(patches, -1), self.midway.reshape(patches, -1)
         count = thick.sum(1)
         share = (thick * midway).sum(1) / (count * self.heights.shape[1]).clip(min=1)
-        return on_host((share < few) & (count / thick.shape[1] > 0.5))
+        return np.where(on_host(count / thick.shape[1] > 0.5), on_host(share), 1.0)
 
     def share_left(self, step: Floats, few: float, full: float = _FULL_STEP_STDS, none: float = _NO_STEP_STDS) -> float:
         """Say how much is made of (n, 3), the first of the points' step, if it brings walls together.
@@ -79,7 +84,7 @@ class _Heights:
         full, none: moves across, in stds of the noise, up to which all is made of it, and from which on nothing.
         """
         thick = self.thick[: len(step)]
-        if not self.are_walls(few).all() or not thick.any():
+        if self.midway_shares().item() >= few or not thick.any():
             return 1.0
         rise = (step * self.normals[: len(step)]).sum(axis=1)[thick]
         noise = float(np.median(self.fit.noise_about_walls(self.heights)[self.thick]))
@@ -120,26 +125,33 @@ class _LocalFit:
         return np.sqrt(left)
 
 
-def between_walls(near: Nearest, patches: int, *, uncovered: bool = False) -> npt.NDArray[np.bool_]:
-    """Say of M patches whether their points may be on walls close together, by the nearest 24 and 64: (M, 2).
+def midway_shares(near: Nearest, patches: int) -> Floats:
+    """Return how many neighbours of M patches' points lie half way, by the nearest 24 and 64: (M, 2), 0..1.
 
-    near: of as many points of each patch, patch after patch; uncovered: whether a pass has taken the noise of what is
-    one surface.
+    near: of as many points of each patch, patch after patch.
     """
-    few = _UNCOVERED_MIDWAY_SHARE if uncovered else _MAYBE_WALLS_MIDWAY_SHARE
-    found = [_Heights.of(near.first(count)).are_walls(few, patches) for count in _NEIGHBOUR_COUNTS[:2]]
+    found = [_Heights.of(near.first(count)).midway_shares(patches) for count in _NEIGHBOUR_COUNTS[:2]]
     return np.stack(found, axis=1)
 
 
-def has_walls(found: Sequence[npt.NDArray[np.bool_]]) -> bool:
-    """Say whether a cloud may have walls close together; found: of its patches, or some, as of `between_walls`."""
-    return bool(np.concatenate(found).mean(axis=0).max() > _WALL_PATCHES_SHARE)
+def has_walls(shares: Floats, *, uncovered: bool = False) -> bool:
+    """Say whether a cloud may have walls close together; shares: of its patches, or some, (M, 2), `midway_shares`.
+
+    uncovered: whether a pass has taken the noise of what is one surface.
+    """
+    few = _UNCOVERED_MIDWAY_SHARE if uncovered else _MAYBE_WALLS_MIDWAY_SHARE
+    return bool((shares < few).mean(axis=0).max() > _WALL_PATCHES_SHARE)
+
+
+def may_hide_walls(shares: Floats) -> bool:
+    """Say whether the noise of a cloud may hide such walls; shares: as of `has_walls`."""
+    return bool((shares[:, 1] < _HIDDEN_MIDWAY_SHARE).mean() > _WALL_PATCHES_SHARE)
 
 
 def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False, by_chance: bool = False) -> float:
     """Return the share of a step (n, 3) that leaves walls apart: 0 where it joins them, 1 where there are none.
 
-    patch: (P, 3) points, of which the first n >= 1 make the step; uncovered: as of `between_walls`; by_chance: whether
+    patch: (P, 3) points, of which the first n >= 1 make the step; uncovered: as of `has_walls`; by_chance: whether
     that is how the points lie on the walls, not evenly.
     """
     few = _UNCOVERED_MIDWAY_SHARE if uncovered else _WALLS_MIDWAY_SHARE

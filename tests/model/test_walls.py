@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import fpsample
 import numpy as np
 import pytest
@@ -112,6 +114,23 @@ def test_a_noisy_surface_has_no_walls_after_a_pass() -> None:
     for rough in (noisy(even_sphere(8000), 0.005), noisy(plate(2000, 0.0), 0.01)):
         patches = cut_patches(rough, coverage=3.0, seed=0)
         assert not Sampling.of(rough, patches, 0.0).after_pass(rough, patches).thin_walls
+
+
+def test_a_sheet_that_a_pass_leaves_in_two_layers_has_no_walls() -> None:
+    rough, layers = noisy(plate(10_000, 0.0), 0.012), noisy(plate(10_000, 0.008), 0.001)
+    patches = cut_patches(layers, coverage=3.0, seed=0)
+    before = Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), 0.012)
+    assert not before.after_pass(layers, patches).thin_walls
+    assert replace(before, hides_walls=True).after_pass(layers, patches).thin_walls
+
+
+@pytest.mark.parametrize("count", [3000, 10_000])
+def test_noise_may_hide_walls_but_not_in_a_sheet(count: int) -> None:
+    """Of walls 2.5 stds of the noise apart nothing shows before a pass; a sheet's 64 neighbours differ all the same."""
+    for gap, hides in ((0.0, False), (0.03, True)):
+        rough = noisy(plate(count, gap), 0.012)
+        seen = Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), 0.012)
+        assert (seen.thin_walls, seen.hides_walls) == (False, hides)
 
 
 def pipe(count: int, seed: int = 0) -> np.ndarray:
