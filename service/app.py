@@ -126,6 +126,7 @@ def serve(settings: Settings) -> None:
         port=settings.port,
         root_path=settings.root_path,
         timeout_graceful_shutdown=settings.shutdown_seconds,
+        workers=1,  # said, so that uvicorn does not read WEB_CONCURRENCY, which may be no number
         lifespan="on",
         http=connection_class(settings),
         ws="none",

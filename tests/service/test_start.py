@@ -65,6 +65,12 @@ def test_a_server_whose_stdout_is_closed_starts(tmp_path: Path) -> None:
         assert server._status("/livez") == 200
 
 
+def test_a_server_starts_whatever_web_concurrency_says(tmp_path: Path) -> None:
+    """Platforms set it for servers that fork; uvicorn reads it as a number, even where it is not to fork."""
+    with run_server(tmp_path, environment={"WEB_CONCURRENCY": "auto"}) as server:
+        assert server._status("/livez") == 200
+
+
 def test_what_others_have_in_a_data_directory_stays_there(tmp_path: Path) -> None:
     """A folder of a project, say, that had `jobs` of its own before."""
     theirs = [tmp_path / "data" / name for name in ("jobs/2024/report.txt", "incoming/letter.txt", "servers/www.lock")]
