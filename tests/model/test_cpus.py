@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from straightpcf.model import cpus
 from straightpcf.model.cpus import usable_cpus
 from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
@@ -28,10 +29,42 @@ from tests.clouds import noisy, sphere, torus
 def test_a_process_that_is_held_to_some_cpus_has_those(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 6}, raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(cpus, "_CGROUP", Path("/none"))
     assert usable_cpus() == 3
     network = StraightPCF(width=16, distance_width=16)
     assert Filter(network).threads == 3
     assert Filter(network, threads=2).threads == 2
+
+
+@pytest.mark.parametrize(
+    ("membership", "said", "usable"),
+    [
+        ("0::/", {"cpu.max": "150000 100000\n"}, 2),  # in a container, of Docker or Kubernetes
+        ("0::/a.slice/b.service", {"a.slice/b.service/cpu.max": "max 100000\n", "a.slice/cpu.max": "9 100\n"}, 1),
+        ("0::/a.slice/b.service", {"a.slice/cpu.max": "400000 100000\n"}, 4),
+        ("0::/", {"cpu.max": "max 100000\n"}, 8),
+        ("0::/", {"cpu.max": "6400000 100000\n"}, 8),
+        ("0::/", {"cpu.max": "?\n"}, 8),
+        ("0::/", {}, 8),
+        (
+            "4:memory:/of/the/host\n3:cpu,cpuacct:/of/the/host\n0::/",  # version 1, whose paths are the host's
+            {"cpu/cpu.cfs_quota_us": "300000\n", "cpu/cpu.cfs_period_us": "100000\n"},
+            3,
+        ),
+        ("3:cpu:/", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+    ],
+)
+def test_a_process_that_is_granted_the_time_of_some_cpus_has_as_many_threads(
+    membership: str, said: dict[str, str], usable: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "membership").write_text(f"{membership}\n")
+    for name, text in said.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(cpus, "_CGROUP", tmp_path / "membership")
+    monkeypatch.setattr(cpus, "_CGROUPS", tmp_path)
+    assert usable_cpus() == usable
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1.5, 1025, 99_999_999_999])
@@ -51,6 +84,7 @@ def test_where_the_system_cannot_say_all_are_taken(
 ) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: there)
+    monkeypatch.setattr(cpus, "_CGROUP", Path("/none"))
     assert usable_cpus() == usable
 
 
