@@ -16,7 +16,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from straightpcf.points.errors import IdConflict, IdempotencyConflict, InvalidRequest, NotFound, StraightPCFError
+from straightpcf.points.errors import (
+    IdConflict,
+    IdempotencyConflict,
+    InternalError,
+    InvalidRequest,
+    NotFound,
+    StraightPCFError,
+)
 from straightpcf.service.jobs.database import open_database, transaction
 from straightpcf.service.jobs.record import (
     FINISHED,
@@ -33,8 +40,10 @@ from straightpcf.service.jobs.record import (
 from straightpcf.service.jobs.rows import event_of, record_of
 from straightpcf.service.jobs.turns import count_turn, next_row, positions
 
-__all__ = ["JobStore"]
+__all__ = ["MAX_ATTEMPTS", "JobStore"]
 
+# Of a job whose server dies; more than the runner's MAX_DEATHS of workers, for servers die of much else.
+MAX_ATTEMPTS = 6
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
 _ENDED: tuple[JobState, ...] = tuple(sorted(FINISHED - {"expired"}))
@@ -243,15 +252,27 @@ class JobStore:
             return mine
 
     def recover(self, dead_servers: Collection[str] = (), *, expires_in: float) -> list[str]:
-        """Release the jobs whose lease ran out, or whose server is known to be dead; return their ids."""
+        """Release the jobs whose lease ran out, or whose server is known to be dead; return their ids.
+
+        One that had MAX_ATTEMPTS and whose server died fails: where a cloud asks for more memory than a container may
+        have, and all of that is killed for it (Kubernetes), it would be begun for ever, and no other job.
+        """
         with self._transaction():
+            is_dead = f"IFNULL(server IN ({', '.join('?' * len(dead_servers))}), 0)"
             rows = self._db.execute(
-                f"UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0, fence = fence + 1"
-                f" WHERE state IN {_WORKING} AND (lease_until < ? OR server IN ({', '.join('?' * len(dead_servers))}))"
-                " RETURNING id",
-                (time.monotonic(), *dead_servers),
+                f"SELECT id, attempts, cancel_requested, {is_dead} AS died FROM jobs"
+                f" WHERE state IN {_WORKING} AND (lease_until < ? OR {is_dead})",
+                (*dead_servers, time.monotonic(), *dead_servers),
             ).fetchall()
             for row in rows:
+                if row["died"] and row["attempts"] >= MAX_ATTEMPTS and not row["cancel_requested"]:
+                    self._end(row["id"], "failed", error=_given_up(row["attempts"]), expires_in=expires_in)
+                    continue
+                self._db.execute(
+                    "UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0,"
+                    " fence = fence + 1 WHERE id = ?",
+                    (row["id"],),
+                )
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
 
@@ -348,6 +369,11 @@ class JobStore:
     def _record(self, row: sqlite3.Row) -> JobRecord:
         queued = positions(self._db, row["owner"], [row["seq"]] if row["state"] == "queued" else [])
         return record_of(row, queued.get(row["seq"]))
+
+
+def _given_up(attempts: int) -> dict[str, str]:
+    said = f"its server died while it worked on it, in attempt {attempts}; the cloud was then given up"
+    return {"code": InternalError.code, "detail": said}
 
 
 def _canceled(id: str) -> dict[str, str]:

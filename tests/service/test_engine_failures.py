@@ -27,7 +27,7 @@ from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import runner
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import Claim
-from straightpcf.service.jobs.store import Hold, JobStore
+from straightpcf.service.jobs.store import MAX_ATTEMPTS, Hold, JobStore
 from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, running, submit, until
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -225,6 +225,39 @@ def test_a_canceled_job_is_not_started_again_when_its_worker_or_server_dies(tmp_
 
     play(tmp_path / "worker", worker, WorkerDied("killed"))
     play(tmp_path / "server", server)
+
+
+def test_a_job_whose_server_dies_each_time_is_given_up_and_the_next_ones_are_done(tmp_path: Path) -> None:
+    """As where it needs more memory than its container may have, and the whole container is killed for it."""
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        fatal, other = [(await submit(engine, content))[0] for content in (b"0", b"1")]
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            assert (await engine.get(fatal.id)).state == "queued"
+            claim = await engine._call(JobStore.claim, "the dead", 15.0)
+            assert (claim.record.id, claim.record.attempts) == (fatal.id, attempt)
+            await engine._sweeper.sweep()
+        record = await engine.get(fatal.id)
+        assert record.state == "failed"
+        assert isinstance(record.error, InternalError)
+        assert "attempt 6; the cloud was then given up" in record.error.message
+        assert (await kinds(engine, fatal.id))[-1] == "completed"
+        backend.go.set()
+        backend.finish.set()
+        assert (await engine.wait(other.id)).state == "succeeded"
+
+    play(tmp_path, scenario)
+
+
+def test_a_lease_that_runs_out_gives_no_job_up(tmp_path: Path) -> None:
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine)
+        for _ in range(MAX_ATTEMPTS + 1):
+            await engine._call(JobStore.claim, engine._folders.server, -1.0)  # of a server that lives
+            await engine._sweeper.sweep()
+        assert (await engine.get(record.id)).state == "queued"
+
+    play(tmp_path, scenario)
 
 
 def test_a_full_disk_is_the_same_error_from_files_and_from_the_store(tmp_path: Path) -> None:
