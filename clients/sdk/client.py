@@ -28,6 +28,9 @@ DEFAULT_TIMEOUT_SECONDS = 60.0  # of silence: a server that works says something
 class Client:
     """Call a server from ordinary code; use it as a context manager or close it.
 
+    Threads may share one, over HTTP forked processes, too. gRPC itself can hang in a process that was forked after it
+    was used: let multiprocessing `spawn` there.
+
     url: where the server is, "http://127.0.0.1:8000"; "grpc://127.0.0.1:50051" (or grpcs://) needs the extra `grpc`.
     api_key: sent as a bearer token. HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE and SSL_CERT_DIR are
     heeded over HTTP.

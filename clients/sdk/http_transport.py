@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import httpx2
 
+from straightpcf.clients.sdk.per_process import PerProcess
 from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.response import failed_connection, failed_response
@@ -28,18 +29,18 @@ class HttpTransport(Transport):
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
         self.timeout, self.max_retries, self._url = timeout, max_retries, without_password(url)
-        self._http = _made(httpx2.Client, url, api_key, timeout)
+        self._http = PerProcess(lambda: _made(httpx2.Client, url, api_key, timeout))
 
     def close(self) -> None:
         """Close the connections."""
         self.closed = True
-        self._http.close()
+        self._http.get().close()
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one request."""
-        asked = _request(call, receiver, self.timeout)
+        asked, body = _request(call, receiver, self.timeout), None if call.body is None else call.chunks()
         try:
-            with self._http.stream(**asked, content=None if call.body is None else call.chunks()) as response:
+            with self._http.get().stream(**asked, content=body) as response:
                 if response.is_success:
                     attempts.answered()
                     receiver.begin(response.status_code, response.headers)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -321,3 +324,36 @@ def test_delays_grow_stay_bounded_and_follow_the_server() -> None:
     at_once = retry.Failure(error=ConnectionFailed("503"), retryable=True, retry_after=0.0)
     assert retry.next_delay(at_once, attempt=0) == 0.0
     assert retry.next_delay(at_once, attempt=1) == retry.FIRST_DELAY_SECONDS  # for a minute, it may be
+
+
+FORKED = """
+import os, sys
+from straightpcf.clients.sdk import Client
+client = Client(sys.argv[1], timeout=5, max_retries=0)
+client.health()
+child = os.fork()
+if child == 0:
+    os._exit(not client.health().ready)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) or not client.health().ready)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_shares_no_connection_with_its_parent() -> None:
+    of_requests: list[int] = []
+
+    def answer(connection: socket.socket, number: int) -> None:
+        with connection:
+            while connection.recv(65536):
+                of_requests.append(number)
+                connection.sendall(HEALTHY.replace(b"Connection: close", b"Connection: keep-alive"))
+
+    def accept(listener: socket.socket) -> None:
+        for number in range(2):
+            threading.Thread(target=answer, args=(listener.accept()[0], number), daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=accept, args=(listener,), daemon=True).start()
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        subprocess.run([sys.executable, "-c", FORKED, url], check=True, timeout=120)
+    assert of_requests == [0, 1, 0]
