@@ -9,7 +9,8 @@ from python_multipart.multipart import parse_options_header
 
 __all__ = ["disposition", "disposition_name"]
 
-_PLAIN = re.compile(r"[\w.~-]+", re.ASCII)
+# Within quotes, where a blank or a comma says nothing; left out is what readers take for more than it is: " \ % ; * '
+_PLAIN = re.compile(r"[\w.~ !#$&()+,=@\[\]{}^`-]+", re.ASCII)
 # To the end where it is not closed: to look for the end anew from each of its quotes takes minutes.
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*+"?')
 _EXTENDED = re.compile(r";\s*filename\*\s*=\s*(UTF-8|ISO-8859-1)'[\w-]*'([\w!#$&+.^`|~%-]+)", re.ASCII | re.IGNORECASE)

@@ -11,7 +11,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from straightpcf.service.api.disposition import disposition_name
+from straightpcf.service.api.disposition import disposition, disposition_name
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
 from tests.service.in_process import serving
@@ -206,3 +206,15 @@ def test_a_name_whose_quotes_are_not_closed_is_read_in_one_go() -> None:
     assert disposition_name('attachment; filename="' + '\\"' * 20_000) is not None
     assert time.process_time() - began < 2
     assert disposition_name("""a; x="b; filename*=UTF-8''no"; filename*=UTF-8''yes""") == "yes"
+
+
+@pytest.mark.parametrize("name", ["my scan_clean.ply", "scan (1)_clean.ply", "a,b=c@d+e[1]&{f}_clean.xyz"])
+def test_a_result_whose_name_is_ascii_is_called_so_in_the_form_that_every_client_reads(name: str) -> None:
+    assert disposition(name) == f'attachment; filename="{name}"'
+    assert disposition_name(disposition(name)) == name
+
+
+@pytest.mark.parametrize("name", ["é.ply", 'a"b.ply', "a\\b.ply", "a%20b.ply", "a;b.ply", "a*b.ply", "a'b.ply"])
+def test_any_other_name_is_said_in_the_extended_form(name: str) -> None:
+    assert disposition(name).startswith("attachment; filename*=utf-8''")
+    assert disposition_name(disposition(name)) == name
