@@ -14,11 +14,13 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
+from straightpcf.points.formats.positions import rounding
 from straightpcf.points.formats.scalars import scalar_columns
 
 __all__ = ["TAKEN", "TYPES", "check_new", "new_las", "renamed"]
 
 FINEST_USUAL_SCALE = 1e-4
+_MOST_LOST = 1e-4  # of the extent of most points, by rounding to a step of the scale
 MAX_EXTRA_DIMENSIONS = 300
 _HEADER_BYTES = 227
 TAKEN = ("x", "y", "z", "X", "Y", "Z")  # laspy calls positions and their integers so
@@ -29,7 +31,7 @@ _RESERVED = ("bit_fields", "raw_classification", "header", "scales", "offsets")
 
 def check_new(cloud: PointCloud) -> None:
     """Raise UnsupportedCloud where `new_las` would."""
-    _check_positions(cloud.xyz)
+    _quantised(cloud.xyz)
     _laid_out(cloud)
 
 
@@ -41,7 +43,7 @@ def renamed(cloud: PointCloud) -> list[str]:
 
 
 def new_las(cloud: PointCloud) -> bytes:
-    """Return a LAS 1.2 file, uncompressed; raises UnsupportedCloud where a position is NaN or infinite.
+    """Return a LAS 1.2 file, uncompressed; raises UnsupportedCloud where positions are not finite or lie too far apart.
 
     Attributes with the name of a standard dimension that fit into it take its place, the others become extra bytes.
     """
@@ -109,6 +111,13 @@ def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], 
     if np.abs(integers).max() >= 2**31:
         offsets = lowest.tolist()
         integers = np.rint((xyz - offsets) / scale)
+    lost, half = rounding(xyz, integers * scale + offsets)
+    if 0 < _MOST_LOST * half < lost / 2:
+        row = int(np.argmax(np.abs(xyz / 2 - np.median(xyz / 2, axis=0)).max(axis=1)))
+        raise UnsupportedCloud(
+            f"point {row}, {xyz[row].tolist()}, lies so far from most that the 32 bits of LAS would put these up to "
+            f"{lost:.3g} off, more than {_MOST_LOST:g} of their extent ({2 * half:.6g}): take it out, or another format"
+        )
     return [scale] * 3, offsets, integers.astype(np.int32)
 
 

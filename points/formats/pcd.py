@@ -220,8 +220,10 @@ def _text_values(
 def _position_type(xyz: npt.NDArray[np.float64]) -> str:
     """Choose float, the only one that PCL's point types and Open3D take, where it holds (N, 3) well; else double."""
     with np.errstate(over="ignore", invalid="ignore"):
-        lost, half = rounding(xyz, xyz.astype("<f4"))
-    return "<f4" if lost / 2 <= _MOST_LOST * half else "<f8"
+        stored = xyz.astype("<f4")
+        lost, half = rounding(xyz, stored)
+    is_held = np.array_equal(np.isfinite(stored), np.isfinite(xyz))
+    return "<f4" if is_held and lost / 2 <= _MOST_LOST * half else "<f8"
 
 
 def _new_file(cloud: PointCloud) -> bytes:

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
+_FAR = 1000  # times as far from the middle as half of all rows are: no point of a scan is
 WRITTEN = frozenset(name for names in (AXES, ("X", "Y", "Z"), *NORMALS) for name in names)  # anew, in a file's place
 
 
@@ -73,13 +74,20 @@ def narrowed(values: npt.NDArray[np.float64], dtype: np.dtype[Any], *, what: str
 
 
 def rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[Any]) -> tuple[float, float]:
-    """Return by how much positions (N, 3) are stored wrong at most, and half of their extent; of finite ones."""
+    """Return by how much positions (N, 3) are stored wrong at most, and half of their extent; of finite ones.
+
+    Of those near most others: beside a row of zeros among UTM coordinates, or of 1e30, any error looks small.
+    """
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.any():
         return 0.0, 0.0
-    here = xyz[finite]
-    half = float((here.max(axis=0) / 2 - here.min(axis=0) / 2).max())  # halves: a difference may overflow
-    return float(np.abs(stored[finite] - here).max()), half
+    halves = xyz[finite] / 2  # a difference may overflow
+    away = np.abs(halves - np.median(halves, axis=0)).max(axis=1)
+    reach = float(np.median(away))
+    near = away / _FAR <= reach if reach > 0 else np.ones(len(away), dtype=bool)
+    half = float((halves[near].max(axis=0) - halves[near].min(axis=0)).max())
+    rows = np.flatnonzero(finite)[near]
+    return float(np.abs(stored[rows] - xyz[rows]).max()), half
 
 
 def put_positions(

@@ -80,6 +80,9 @@ def test_what_float32_would_blur_is_refused_as_a_frame(frame: Path) -> None:
     town = foreign.with_xyz(foreign.xyz * 100 + [691_000.0, 5_334_000.0, 520.0])
     with pytest.raises(UnsupportedCloud, match=r"rounded to float32.* up to 0\.25 off.*: take another format"):
         write_cloud(town, out, format)
+    town.xyz[0] = 0  # a row of no data, beside which a quarter of a metre is little
+    with pytest.raises(UnsupportedCloud, match=r"rounded to float32.* up to 0\.25 off"):
+        write_cloud(town, out, format)
 
 
 @pytest.mark.parametrize("columns", [3, 5, 6])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import sys
 import tracemalloc
@@ -49,6 +50,19 @@ def test_moved_points_keep_their_wave_packets(point_format: int, suffix: str, tm
     again, _ = read_cloud(after)
     for name, values in cloud.attributes.items():
         assert again.attributes[name].tobytes() == values.tobytes(), name
+
+
+@pytest.mark.parametrize(("offset", "far"), [(0, 1e30), (0, 1e6), ((691_000.0, 5_334_000.0, 520.0), 0.0)])
+def test_a_far_point_that_would_put_all_others_in_wrong_places_is_refused_and_named(
+    offset: Any, far: float, tmp_path: Path
+) -> None:
+    """The 32 bits of LAS reach from the farthest point to the others: 1e30 for "no data", or zeros in UTM."""
+    xyz = torus(N) + offset
+    format = format_named("las")
+    format.check(PointCloud(xyz))
+    xyz[7] = far
+    with pytest.raises(UnsupportedCloud, match=rf"point 7, \[{re.escape(str(far))}, .*take it out, or another format"):
+        format.check(PointCloud(xyz))
 
 
 def test_points_that_only_the_count_of_before_1_4_counts_are_read(tmp_path: Path) -> None:

@@ -40,6 +40,14 @@ def test_a_new_file_has_float_positions_where_they_hold_the_cloud(offset: float,
     np.testing.assert_allclose(read_cloud(out)[0].xyz, xyz, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("far", [0.0, 1e30, 1e39])
+def test_a_far_point_does_not_make_float_positions_of_a_town(far: float, tmp_path: Path) -> None:
+    xyz = torus(100) * 10 + [691_000.0, 5_334_000.0, 520.0]
+    xyz[0] = far
+    write_cloud(PointCloud(xyz), out := tmp_path / "new.pcd", format_named("pcd"))
+    np.testing.assert_array_equal(read_cloud(out)[0].xyz, xyz)
+
+
 def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None:
     raw = HEADER + b"\n1 2 3 7\n\n \t\n4 5 6 8\r\n\r\nnan nan nan 9\n\nrest"
     cloud = _read(tmp_path, raw)
