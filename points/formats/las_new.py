@@ -58,6 +58,7 @@ def new_las(cloud: PointCloud) -> bytes:
     record = _extra_bytes_record(extra)
     begin = _HEADER_BYTES + len(record)
     head = _header(len(cloud), begin, 1 if extra else 0, point_format, rows.shape[1])
+    head += struct.pack("<5I", *_by_return(held.get("return_number"), len(cloud)))
     head += struct.pack("<6d", *scales, *offsets)
     for axis in range(3):
         bounds = (integers[:, axis].max(), integers[:, axis].min()) if len(cloud) else (0, 0)
@@ -185,4 +186,9 @@ def _header(points: int, begin: int, records: int, point_format: int, row_bytes:
         raise UnsupportedCloud(f"{points} points are more than the 4294967295 that LAS 1.2 holds")
     software = struct.pack("<4sHH16sBB32s32s", b"LASF", 0, 0, b"", 1, 2, b"OTHER", b"straightpcf")
     sizes = struct.pack("<HHHII", 1, 2024, _HEADER_BYTES, begin, records)
-    return software + sizes + struct.pack("<BHI5I", point_format, row_bytes, points, points, 0, 0, 0, 0)
+    return software + sizes + struct.pack("<BHI", point_format, row_bytes, points)
+
+
+def _by_return(numbers: npt.NDArray[Any] | None, points: int) -> list[int]:
+    """Count the points of each of five returns; all are first ones where no (N,) numbers say otherwise."""
+    return [points, 0, 0, 0, 0] if numbers is None else [int((numbers == which).sum()) for which in range(1, 6)]

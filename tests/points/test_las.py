@@ -65,6 +65,13 @@ def test_a_far_point_that_would_put_all_others_in_wrong_places_is_refused_and_na
         format.check(PointCloud(xyz))
 
 
+@pytest.mark.parametrize(("numbers", "counts"), [(None, [N, 0, 0]), (np.arange(N) % 3 + 1.0, [17, 17, 16])])
+def test_a_new_file_counts_its_points_by_return(numbers: Any, counts: list[int], tmp_path: Path) -> None:
+    attributes: dict[str, npt.NDArray[Any]] = {} if numbers is None else {"return_number": numbers}
+    write_cloud(PointCloud(torus(N), attributes), out := tmp_path / "new.las", format_named("las"))
+    assert laspy.read(out).header.number_of_points_by_return[:3].tolist() == counts
+
+
 def test_points_that_only_the_count_of_before_1_4_counts_are_read(tmp_path: Path) -> None:
     raw = bytearray(_waveform_file(path := tmp_path / "a.las", 9, is_noise=False).read_bytes())
     struct.pack_into("<I", raw, 107, N)
