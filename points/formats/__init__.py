@@ -49,8 +49,21 @@ _NOT_OURS = {
     "as (N, 5) float32 in a .npy file it can be taken"
 }
 
-# CloudCompare's own, which it saves by default, under the suffix of KITTI's frames: CCB2 and the like.
-_CLOUDCOMPARE = re.compile(rb"CCB[0-?]")
+# The first ten lines of a PTX file: columns, rows, four of the scanner's pose, four of a matrix.
+_WHOLE = rb"[ \t]*\d+[ \t]*\r?\n"
+_THREE, _FOUR = (rb"[ \t]*" + rb"[ \t]+".join([rb"[-+.\deE]+"] * count) + rb"[ \t]*\r?\n" for count in (3, 4))
+
+# How files of other programs begin, whatever they are called, and what to do about them.
+_FOREIGN = (
+    # CloudCompare saves it by default, under the suffix of KITTI's frames: CCB2 and the like.
+    (re.compile(rb"CCB[0-?]"), "a BIN file of CloudCompare's own: save it as PLY or LAS there"),
+    (re.compile(rb"ASTM-E57"), "an E57 file: save it as PLY or LAS, with CloudCompare or PDAL"),
+    (
+        re.compile(_WHOLE * 2 + _THREE * 4 + _FOUR * 4),
+        "a PTX file, whose scans have a pose each: save it as PTS, PLY or LAS, with CloudCompare or its own program",
+    ),
+    (re.compile(rb"ncols\s+\d", re.IGNORECASE), "an ESRI grid of heights: turn it into x y z, as GDAL does (XYZ)"),
+)
 
 # How files begin that hold another one.
 _PACKED = {
@@ -154,8 +167,9 @@ def recognised(head: bytes, called: str | None) -> Format:
     for magic, packer in _PACKED.items():
         if head.startswith(magic):
             raise UnknownFormat(f"{name[:80]} is packed with {packer}: unpack it first")
-    if _CLOUDCOMPARE.match(head):
-        raise UnknownFormat(f"{name[:80]} is a BIN file of CloudCompare's own: save it as PLY or LAS there")
+    for beginning, what in _FOREIGN:
+        if beginning.match(head):
+            raise UnknownFormat(f"{name[:80]} is {what}")
     begins, suffix = f"{name[:80]} begins with {head[:8]!r}, which no format does", PurePath(name).suffix.lower()
     for ending, why in _NOT_OURS.items():
         if name.lower().endswith(ending):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import gzip
 import lzma
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from tests.points.samples import SAMPLES, N, plain_cloud
 
 SCANS = Path(__file__).parents[2].parent / "shared" / "data" / "scans"
 TOLERANCE = {"las": 1e-3, "laz": 1e-3, "kitti": 1e-6, "pcd": 1e-6}
+_PTX = b"60\r\n1\r\n1 2 3\r\n1 0 0\r\n0 1 0\r\n0 0 1\r\n1 0 0 0\r\n0 1 0 0\r\n0 0 1 0\r\n1 2 3 1\r\n0.5 -1 2 0.25\r\n"
 every_format = pytest.mark.parametrize("format", FORMATS, ids=lambda format: format.name)
 
 
@@ -182,6 +184,25 @@ def test_a_bin_file_of_cloudcompares_is_called_so(tmp_path: Path) -> None:
     """Its rows can be four float32, too, of which the fourth are no intensities."""
     (path := tmp_path / "scan.bin").write_bytes(b"CCB2" + bytes(60))
     with pytest.raises(UnknownFormat, match=r"scan\.bin is a BIN file of CloudCompare's own: save it as PLY"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "begins", "message"),
+    [
+        ("scan.e57", b"ASTM-E57\x01\0\0\0", "is an E57 file: save it as PLY or LAS, with CloudCompare or PDAL"),
+        *(
+            (name, _PTX, "is a PTX file, whose scans have a pose each: save it as")
+            for name in ("a.ptx", "a.txt", "a.pts")
+        ),
+        ("dem.asc", b"ncols         4\nnrows         6\n", "is an ESRI grid of heights: turn it into x y z"),
+    ],
+)
+def test_a_file_of_another_program_is_called_so_with_what_to_do(
+    name: str, begins: bytes, message: str, tmp_path: Path
+) -> None:
+    (path := tmp_path / name).write_bytes(begins + bytes(60))
+    with pytest.raises(UnknownFormat, match=re.escape(f"{name} {message}")):
         read_cloud(path)
 
 
