@@ -14,6 +14,7 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count, check_room
 from straightpcf.points.formats.las_layout import (
+    COPC_ID,
     EXTRA_BYTES_ID,
     LASZIP_ID,
     LasHeader,
@@ -85,10 +86,12 @@ class Las(Format):
         return [*cloud.beside, *not_held(cloud.attributes, self.types, taken=TAKEN), *renamed(cloud)]
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise UnsupportedCloud where no new file can be written; LAZ wants its library, too, and a known layout."""
+        """Raise UnsupportedCloud where no file can be written; LAZ wants its library, too, and a known layout."""
         source = cloud.source
         if not isinstance(source, LasSource):
             check_new(cloud)
+        else:
+            _refuse_index(source.header)
         if self.is_compressed:
             check_packing(*((source.header, source.rows) if isinstance(source, LasSource) else ()))
 
@@ -117,6 +120,14 @@ class Laz(Las):
     suffixes: ClassVar[tuple[str, ...]] = (".laz",)
     media_type = "application/vnd.laszip"
     is_compressed = True
+
+
+def _refuse_index(header: LasHeader) -> None:
+    if header.record(*COPC_ID) is not None:
+        raise UnsupportedCloud(
+            "a COPC file is indexed by position, and the index would be wrong: take another format, as PLY, or convert "
+            "it to LAZ first"
+        )
 
 
 def _refuse_degrees(xyz: npt.NDArray[np.float64], header: LasHeader) -> None:
@@ -168,6 +179,7 @@ def _assembled(
     raw: bytes, header: LasHeader, rows: npt.NDArray[np.uint8], *, compressed: bool, keep_bounds: bool
 ) -> list[bytes | memoryview]:
     """Return the file's parts: header, records, points, and what follows them, with every offset where it now is."""
+    _refuse_index(header)
     kept = [record.raw for record in header.records if (record.user_id, record.record_id) != LASZIP_ID]
     record = packing_record(header) if compressed else b""
     old = header.record(*LASZIP_ID)

@@ -167,13 +167,10 @@ def read_header(raw: bytes) -> LasHeader:
     if np.abs(scales).max() > 1e200 or np.abs(offsets).max() > 1e200:
         raise MalformedFile(f"LAS scales {scales.tolist()} or offsets {offsets.tolist()} are beyond 1e200")
     records, end = _records(raw, size, count, begin)
-    header = LasHeader(
+    return LasHeader(
         minor, raw[:size], records, raw[end:begin], point_format, bool(kind & 0x80), row_bytes, points, begin,
         scales, offsets, _first_extended(raw, minor, begin), _wkt(raw, minor, records),
     )  # fmt: skip
-    if header.record(*COPC_ID) is not None:
-        raise UnsupportedCloud("a COPC file is indexed by position, which cannot be kept: convert it to LAZ first")
-    return header
 
 
 def is_geographic(header: LasHeader) -> bool:

@@ -72,6 +72,48 @@ def test_a_new_file_counts_its_points_by_return(numbers: Any, counts: list[int],
     assert laspy.read(out).header.number_of_points_by_return[:3].tolist() == counts
 
 
+def _copc_file(path: Path, *chunks: int) -> Path:
+    """Write what a reader that knows no COPC sees of it: its record first, and chunks of so many points."""
+    lazrs = pytest.importorskip("lazrs", reason="lazrs, of the extra straightpcf[las], is not installed")
+    cloud = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    cloud.header.scales = np.full(3, 0.001)
+    cloud.x, cloud.y, cloud.z = torus(sum(chunks)).T
+    cloud.vlrs.append(laspy.VLR("copc", 1, "", bytes(160)))
+    cloud.write(unpacked := BytesIO())
+    raw, rows = unpacked.getvalue(), cloud.points.array.view(np.uint8).reshape(sum(chunks), -1)
+    (begin,) = struct.unpack_from("<I", raw, 96)
+    vlr = lazrs.LazVlr.new_for_compression(6, 0, True)
+    record = bytes(vlr.record_data())
+    head = raw[:begin] + struct.pack("<H16sHH32s", 0, b"laszip encoded", 22204, len(record), b"") + record
+    sink = BytesIO()
+    sink.write(head)
+    packer = lazrs.LasZipCompressor(sink, vlr)
+    for number, part in enumerate(np.split(rows, np.cumsum(chunks)[:-1])):
+        if number:
+            packer.finish_current_chunk()
+        packer.compress_many(part.reshape(-1))
+    packer.done()
+    packed = bytearray(sink.getvalue())
+    struct.pack_into("<IIB", packed, 96, len(head), 2, 6 | 0x80)
+    path.write_bytes(packed)
+    return path
+
+
+def test_a_copc_file_is_read_and_written_in_other_formats_but_its_index_is_not_made_wrong(tmp_path: Path) -> None:
+    cloud, format = read_cloud(_copc_file(tmp_path / "a.copc.laz", 30, 7, 13))
+    np.testing.assert_allclose(cloud.xyz, torus(N), rtol=0, atol=6e-4)
+    format_named("ply").check(cloud)
+    write_cloud(cloud.with_xyz(cloud.xyz + 0.5), out := tmp_path / "a.ply", format_named("ply"))
+    np.testing.assert_array_equal(read_cloud(out)[0].xyz, cloud.xyz + 0.5)
+    for name in ("las", "laz"):
+        with pytest.raises(UnsupportedCloud, match=r"a COPC file is indexed by position.*take another format, as PLY"):
+            format_named(name).check(cloud)
+        with pytest.raises(UnsupportedCloud, match="a COPC file is indexed by position"):
+            write_cloud(cloud.with_xyz(cloud.xyz + 0.5), tmp_path / f"b.{name}", format_named(name))
+    write_cloud(cloud, again := tmp_path / "c.copc.laz", format)  # nothing has moved
+    assert again.read_bytes() == (tmp_path / "a.copc.laz").read_bytes()
+
+
 def test_points_that_only_the_count_of_before_1_4_counts_are_read(tmp_path: Path) -> None:
     raw = bytearray(_waveform_file(path := tmp_path / "a.las", 9, is_noise=False).read_bytes())
     struct.pack_into("<I", raw, 107, N)
