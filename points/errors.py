@@ -16,6 +16,7 @@ StraightPCFError
 ├── NotFound                no such thing, or not yours
 ├── MethodNotAllowed
 ├── MisdirectedRequest      for a host that this server is not
+├── CrossOrigin             from a page of another site
 ├── RequestTimeout          its body stopped coming
 ├── JobNotFinished          its result is not there yet
 ├── JobExpired              its result is not there any more
@@ -42,6 +43,7 @@ from typing import ClassVar
 __all__ = [
     "ERRORS_BY_CODE",
     "ConnectionFailed",
+    "CrossOrigin",
     "DeviceUnavailable",
     "IdConflict",
     "IdempotencyConflict",
