@@ -39,9 +39,9 @@ class Sampling:
 
     irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
-    hides_walls: whether noise may hide such; uncovered: whether these were looked for once a pass had taken most of it;
-    noise_of_most: the noise std of most points, where a few have so much more that theirs is what is read of all, else
-    infinite.
+    hides_walls: whether noise may hide such; uncovered: whether a pass has taken most of it, and walls that it hid were
+    looked for; noise_of_most: the noise std of most points, where a few have so much more that theirs is what is read
+    of all, else infinite.
     """
 
     irregular: bool = False

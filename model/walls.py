@@ -69,7 +69,7 @@ class _Heights:
         return cls(stds > _THICK_RATIO * near.radii, midway, heights, fit, near.normals)
 
     def midway_shares(self, patches: int = 1) -> Floats:
-        """Return it of each of some patches that the points are of, as many of each, patch after patch: (patches,).
+        """Return the share of neighbours that are midway, (patches,), of as many points of each, patch after patch.
 
         1 where most points have no more height than an edge.
         """

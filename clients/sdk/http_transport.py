@@ -38,8 +38,9 @@ class HttpTransport(Transport):
 
     def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> Iterator[None]:
         """Make one request."""
-        asked, body = _request(call, receiver, self.timeout), None if call.body is None else call.chunks()
+        asked = _request(call, receiver, self.timeout)
         try:
+            body = None if call.body is None else call.chunks()
             with self._http.get().stream(**asked, content=body) as response:
                 if response.is_success:
                     attempts.answered()

@@ -14,7 +14,7 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
-from straightpcf.points.formats.positions import rounding
+from straightpcf.points.formats.positions import from_middle, rounding
 from straightpcf.points.formats.scalars import scalar_columns
 
 __all__ = ["TAKEN", "TYPES", "check_new", "new_las", "renamed"]
@@ -114,7 +114,7 @@ def _quantised(xyz: npt.NDArray[np.float64]) -> tuple[list[float], list[float], 
         integers = np.rint((xyz - offsets) / scale)
     lost, half = rounding(xyz, integers * scale + offsets)
     if 0 < _MOST_LOST * half < lost / 2:
-        row = int(np.argmax(np.abs(xyz / 2 - np.median(xyz / 2, axis=0)).max(axis=1)))
+        row = int(np.argmax(from_middle(xyz)))
         raise UnsupportedCloud(
             f"point {row}, {xyz[row].tolist()}, lies so far from most that the 32 bits of LAS would put these up to "
             f"{lost:.3g} off, more than {_MOST_LOST:g} of their extent ({2 * half:.6g}): take it out, or another format"

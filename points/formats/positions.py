@@ -16,6 +16,7 @@ __all__ = [
     "WRITTEN",
     "axes_among",
     "changes",
+    "from_middle",
     "gathered",
     "moved",
     "narrowed",
@@ -81,13 +82,19 @@ def rounding(xyz: npt.NDArray[np.float64], stored: npt.NDArray[Any]) -> tuple[fl
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.any():
         return 0.0, 0.0
-    halves = xyz[finite] / 2  # a difference may overflow
-    away = np.abs(halves - np.median(halves, axis=0)).max(axis=1)
+    away = from_middle(xyz[finite])
     reach = float(np.median(away))
     near = away / _FAR <= reach if reach > 0 else np.ones(len(away), dtype=bool)
-    half = float((halves[near].max(axis=0) - halves[near].min(axis=0)).max())
     rows = np.flatnonzero(finite)[near]
+    half = float((xyz[rows].max(axis=0) / 2 - xyz[rows].min(axis=0) / 2).max())  # a difference may overflow
     return float(np.abs(stored[rows] - xyz[rows]).max()), half
+
+
+def from_middle(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return how far finite positions (N, 3) are from their median along any axis, (N,), halved: it may overflow."""
+    halves = xyz / 2
+    away: npt.NDArray[np.float64] = np.abs(halves - np.median(halves, axis=0)).max(axis=1)
+    return away
 
 
 def put_positions(

@@ -13,7 +13,7 @@ CREATE TABLE IF NOT EXISTS jobs (
   points INTEGER,
   progress REAL NOT NULL DEFAULT 0,
   attempts INTEGER NOT NULL DEFAULT 0,
-  deaths INTEGER NOT NULL DEFAULT 0,  -- of workers that had it: a cloud that kills them is given up, one whose server died is not
+  deaths INTEGER NOT NULL DEFAULT 0,  -- of workers that had it, not of servers: a cloud that kills three is given up
   fence INTEGER NOT NULL DEFAULT 0,
   server TEXT,                        -- who works on it
   lease_until REAL,                   -- and until when that is believed: seconds since the machine began

@@ -46,6 +46,7 @@ __all__ = ["MAX_ATTEMPTS", "JobStore"]
 MAX_ATTEMPTS = 6
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+_RELEASED = "state = 'queued', server = NULL, lease_until = NULL, progress = 0"
 _ENDED: tuple[JobState, ...] = tuple(sorted(FINISHED - {"expired"}))
 _DETAIL = 1000  # characters of what a job failed of that are kept: what a file says may be in it
 _PASSING: tuple[EventKind, ...] = ("preview", "progress")
@@ -245,8 +246,7 @@ class JobStore:
         died: it killed its worker, as far as one can tell.
         """
         with self._transaction():
-            set_ = "state = 'queued', server = NULL, lease_until = NULL, progress = 0, deaths = deaths + ?"
-            mine = self._update(id, fence, set_, int(died))
+            mine = self._update(id, fence, f"{_RELEASED}, deaths = deaths + ?", int(died))
             if mine:
                 self._requeued(id, message, expires_in)
             return mine
@@ -258,21 +258,17 @@ class JobStore:
         have, and all of that is killed for it (Kubernetes), it would be begun for ever, and no other job.
         """
         with self._transaction():
-            is_dead = f"IFNULL(server IN ({', '.join('?' * len(dead_servers))}), 0)"
             rows = self._db.execute(
-                f"SELECT id, attempts, cancel_requested, {is_dead} AS died FROM jobs"
-                f" WHERE state IN {_WORKING} AND (lease_until < ? OR {is_dead})",
-                (*dead_servers, time.monotonic(), *dead_servers),
+                "SELECT id, server, attempts, cancel_requested FROM jobs"
+                f" WHERE state IN {_WORKING} AND (lease_until < ? OR server IN ({', '.join('?' * len(dead_servers))}))",
+                (time.monotonic(), *dead_servers),
             ).fetchall()
             for row in rows:
-                if row["died"] and row["attempts"] >= MAX_ATTEMPTS and not row["cancel_requested"]:
+                died = row["server"] in dead_servers
+                if died and row["attempts"] >= MAX_ATTEMPTS and not row["cancel_requested"]:
                     self._end(row["id"], "failed", error=_given_up(row["attempts"]), expires_in=expires_in)
                     continue
-                self._db.execute(
-                    "UPDATE jobs SET state = 'queued', server = NULL, lease_until = NULL, progress = 0,"
-                    " fence = fence + 1 WHERE id = ?",
-                    (row["id"],),
-                )
+                self._db.execute(f"UPDATE jobs SET {_RELEASED}, fence = fence + 1 WHERE id = ?", (row["id"],))
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
 
