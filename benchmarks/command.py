@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 
-from straightpcf.model.filter import device_named
-from straightpcf.model.train.command import errors_in_one_line, file_to_write, noise_level, positive, seed_number
-from straightpcf.points.errors import DeviceUnavailable
+from straightpcf.model.train.command import (
+    device,
+    errors_in_one_line,
+    file_to_write,
+    noise_level,
+    positive,
+    seed_number,
+)
 
 __all__ = [
     "coverage",
@@ -27,14 +32,6 @@ def coverage(text: str) -> float:
     if not 1 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is no coverage, which is 1 or more")
     return value
-
-
-def device(text: str) -> str:
-    """Read a device, for argparse, as the filter does: one that is not here is found out before the work."""
-    try:
-        return device_named(text)
-    except DeviceUnavailable as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def share_of_two(text: str) -> float:

@@ -8,9 +8,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from straightpcf.points.errors import StraightPCFError
+from straightpcf.model.filter import device_named
+from straightpcf.points.errors import DeviceUnavailable, StraightPCFError
 
-__all__ = ["archive_to_write", "errors_in_one_line", "file_to_write", "noise_level", "positive", "seed_number"]
+__all__ = [
+    "archive_to_write",
+    "device",
+    "errors_in_one_line",
+    "file_to_write",
+    "noise_level",
+    "positive",
+    "seed_number",
+]
 
 
 @contextmanager
@@ -27,6 +36,14 @@ def archive_to_write(text: str) -> Path:
     if not text.endswith(".npz"):
         raise argparse.ArgumentTypeError(f"{text} is no name for an archive, which ends in .npz")
     return file_to_write(text)
+
+
+def device(text: str) -> str:
+    """Read a device, for argparse, as the filter does: one that is not here is found out before the work."""
+    try:
+        return device_named(text)
+    except DeviceUnavailable as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def file_to_write(text: str) -> Path:

@@ -21,7 +21,14 @@ from straightpcf.model.filter import Filter, Run, load_filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.tiles import Tiling
 from straightpcf.model.train.archive import by_stem, fingerprint, opened, read_array, split_name, write_archive
-from straightpcf.model.train.command import archive_to_write, errors_in_one_line, noise_level, positive, seed_number
+from straightpcf.model.train.command import (
+    archive_to_write,
+    device,
+    errors_in_one_line,
+    noise_level,
+    positive,
+    seed_number,
+)
 from straightpcf.model.train.data import drawn_noise, held_out_shapes
 from straightpcf.model.train.state import read_network
 from straightpcf.points.errors import InvalidOptions, MalformedFile
@@ -181,9 +188,10 @@ def _main() -> None:
         help="stds, in radii of the bounding sphere, each as likely",
     )
     parser.add_argument("--seed", type=seed_number, default=0)
+    parser.add_argument("--device", type=device, default="cpu", help='"cpu" (the default), "cuda" or "cuda:N"')
     parser.add_argument("--threads", type=positive)
     options = parser.parse_args()
-    denoiser = load_filter(device="cpu", threads=options.threads)
+    denoiser = load_filter(device=options.device, threads=options.threads)
     if options.weights is not None:
         denoiser.network.velocity_modules.load_state_dict(
             read_network(options.weights)[0].velocity_modules.state_dict()

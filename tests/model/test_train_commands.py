@@ -57,6 +57,11 @@ def test_data_that_cannot_be_recorded_is_named(ended: Ended, tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["data.npz"]
 
 
+def test_a_device_that_is_not_here_is_told_before_the_data_is_read(ended: Ended, tmp_path: Path) -> None:
+    said = ended(record, tmp_path / "out.npz", "--data", tmp_path / "none.npz", "--device", "cuda:99")
+    assert said.endswith(f"device cuda:99 was asked for, and torch sees {torch.cuda.device_count()} CUDA devices here")
+
+
 @pytest.mark.parametrize("module", [record, chance, solids, scanned])
 def test_what_cannot_be_written_is_said_before_the_work(module: Any, ended: Ended, tmp_path: Path) -> None:
     data = () if module in (solids, scanned) else ("--data", tmp_path / "data.npz")
