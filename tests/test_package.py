@@ -58,6 +58,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     "path",
     [
         "straightpcf/__init__.py",
+        "straightpcf/__main__.py",
         "straightpcf/py.typed",
         "straightpcf/points/cloud.py",
         "straightpcf/model/kernels/edgeconv.cpp",

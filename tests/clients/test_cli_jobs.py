@@ -153,8 +153,9 @@ def test_what_cannot_be_printed_before_a_command_ends_as_in_one(option: str) -> 
     assert (done.returncode, done.stderr.count(b"\n")) == (3, 1), done.stderr
 
 
-def test_the_console_script_runs_the_same(server: RunningServer) -> None:
-    command = [sys.executable, "-m", "straightpcf.clients", "version"]
+@pytest.mark.parametrize("package", ["straightpcf", "straightpcf.clients"])
+def test_the_console_script_runs_the_same(server: RunningServer, package: str) -> None:
+    command = [sys.executable, "-m", package, "version"]
     assert subprocess.run(command, capture_output=True, check=True).stdout == cli(None, "version").stdout
 
 
