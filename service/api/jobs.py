@@ -80,7 +80,7 @@ async def list_jobs(
     request: Request,
     owner: Owner,
     state: Annotated[list[JobState] | None, Query(description="Only these; may be repeated.")] = None,
-    limit: Annotated[int, Decimal, Query(ge=1, le=MAX_PAGE_SIZE)] = 50,
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE), Decimal] = 50,
     cursor: Annotated[str | None, Query(description="The next_cursor of the page before.")] = None,
 ) -> JobPage:
     """Show this key's jobs, newest first."""
@@ -95,7 +95,7 @@ async def get_job(
     id: str,
     request: Request,
     owner: Owner,
-    wait: Annotated[float, Decimal, Query(ge=0, le=MAX_WAIT_SECONDS, description="Seconds to wait for its end.")] = 0,
+    wait: Annotated[float, Query(ge=0, le=MAX_WAIT_SECONDS, description="Seconds to wait for its end."), Decimal] = 0,
 ) -> Job:
     """Show a job, as soon as it is finished or the wait is over."""
     engine: Engine = request.app.state.engine

@@ -279,6 +279,13 @@ def test_the_openapi_document_names_the_headers_that_are_read(server: RunningSer
         assert named == headers, path
 
 
+def test_the_openapi_document_says_the_limits_of_numbers(server: RunningServer) -> None:
+    paths = json.loads(curl(f"{server.url}/openapi.json").body)["paths"]
+    for path, name, least, most in (("/jobs", "limit", 1, 200), ("/jobs/{id}", "wait", 0, 60)):
+        (schema,) = (each["schema"] for each in paths[path]["get"]["parameters"] if each["name"] == name)
+        assert (schema.get("minimum"), schema.get("maximum")) == (least, most)
+
+
 def test_the_openapi_document_names_what_becomes_of_a_job_meanwhile(server: RunningServer) -> None:
     paths = json.loads(curl(f"{server.url}/openapi.json").body)["paths"]
     assert "404" in paths["/denoise"]["post"]["responses"]  # deleted while it waits
