@@ -33,7 +33,7 @@ from straightpcf.points.wire.patches import PatchReader
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.body import SpoolFile, in_time, next_part
 from straightpcf.service.api.download import open_result
-from straightpcf.service.api.grpc_call import Caller, Context, answering
+from straightpcf.service.api.grpc_call import Caller, Context, LateParsing, answering
 from straightpcf.service.api.intake import Coming, file_name
 from straightpcf.service.api.schemas import MAX_WAIT_SECONDS, Info, Job, rfc3339
 from straightpcf.service.engine import Engine, JobRequest
@@ -75,7 +75,7 @@ class GrpcServer:
 
     async def start(self) -> None:
         """Begin to listen; raises InvalidOptions if the port is taken."""
-        server = grpc.aio.server(options=_OPTIONS)
+        server = grpc.aio.server(options=_OPTIONS, interceptors=[LateParsing()])
         stubs.add_DenoiseServiceServicer_to_server(self._service, server)  # type: ignore[no-untyped-call]
         health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
         reflection.enable_server_reflection((SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME), server)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sqlite3
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Never, TypeAlias
@@ -24,7 +24,7 @@ from straightpcf.service.api.intake import checked_key
 from straightpcf.service.api.request_id import usable_id
 from straightpcf.service.telemetry import Telemetry
 
-__all__ = ["Caller", "Context", "answering"]
+__all__ = ["Caller", "Context", "LateParsing", "answering"]
 
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
@@ -43,6 +43,37 @@ class Caller:
     request_id: str
     idempotency_key: str | None
     traceparent: str | None
+
+
+class LateParsing(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc.aio is untyped
+    """Let a request that is none of the schema's reach its method: grpc itself would answer UNKNOWN, and no more."""
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler:
+        """Return the handler of a call; what its single request is, is told where that is first looked at."""
+        handler: Any = await continuation(handler_call_details)
+        if handler is None or handler.request_streaming:  # the messages of a stream are parsed inside of the method
+            return handler
+        parse = handler.request_deserializer
+        return handler._replace(request_deserializer=lambda data: _parsed(parse, data))
+
+
+class _Unparsable:
+    def __init__(self, fault: DecodeError) -> None:
+        self._fault = fault
+
+    def __getattr__(self, name: str) -> Never:
+        raise self._fault
+
+
+def _parsed(parse: Callable[[bytes], Any], data: bytes) -> Any:
+    try:
+        return parse(data)
+    except DecodeError as fault:
+        return _Unparsable(fault)
 
 
 @asynccontextmanager

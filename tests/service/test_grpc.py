@@ -200,6 +200,16 @@ def test_a_stream_of_another_schema_is_the_callers_fault(server: RunningServer, 
     assert f"request {info.metadata['request_id']}" not in server.log.read_text()
 
 
+@pytest.mark.parametrize("method", ["GetJob", "ListJobs", "CancelJob", "DeleteJob", "WatchJob", "StreamPatches"])
+def test_a_request_of_another_schema_is_too(channel: Any, method: str) -> None:
+    kind = channel.unary_stream if method in ("WatchJob", "StreamPatches") else channel.unary_unary
+    call = kind(f"/straightpcf.v1.DenoiseService/{method}")
+    latin_1 = b"\x0a\x04caf\xe9\x1a\x04caf\xe9"  # an id, a cursor: clients in C++ send any bytes as a string
+    status, info = error_of(lambda: list(answer) if hasattr(answer := call(latin_1), "__next__") else answer)
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "INVALID_REQUEST")
+    assert info.metadata["request_id"]
+
+
 def test_states_may_be_asked_for_any_number_of_times(stub: Any) -> None:
     id = done(stub)
     asked = [pb.JOB_STATE_SUCCEEDED] * 300_000  # SQLite takes a tenth of that as values
