@@ -29,7 +29,7 @@ from straightpcf.service.api.errors import install_error_handlers
 from straightpcf.service.api.hosts import HostMiddleware, is_loopback
 from straightpcf.service.api.intake import Coming
 from straightpcf.service.api.jobs import router as jobs_router
-from straightpcf.service.api.openapi import document_problems
+from straightpcf.service.api.openapi import complete_document
 from straightpcf.service.api.request_id import RequestIdMiddleware
 from straightpcf.service.api.rest import router
 from straightpcf.service.api.target import TargetMiddleware
@@ -103,7 +103,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.include_router(router)
     app.include_router(jobs_router)
     install_page(app)
-    document_problems(app)
+    complete_document(app)
     app.add_api_route(
         "/metrics", telemetry.endpoint, include_in_schema=False, dependencies=[Depends(owner_of)], methods=["GET"]
     )

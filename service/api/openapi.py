@@ -8,7 +8,7 @@ from fastapi import FastAPI
 
 from straightpcf.points.formats import FORMATS
 from straightpcf.points.options import MAX_ITERATIONS
-from straightpcf.service.api.schemas import Problem
+from straightpcf.service.api.schemas import Job, Problem
 
 __all__ = [
     "DENOISE_BODY",
@@ -27,7 +27,7 @@ __all__ = [
     "RESULT_PARAMETERS",
     "RESULT_RESPONSES",
     "STREAM_RESPONSES",
-    "document_problems",
+    "complete_document",
     "problems",
 ]
 
@@ -243,13 +243,15 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {status: _problem(status) for status in sorted({*statuses, *_ANYWHERE})}
 
 
-def document_problems(app: FastAPI) -> None:
-    """Put the schema that every problem refers to into the app's OpenAPI document."""
+def complete_document(app: FastAPI) -> None:
+    """Put into the app's OpenAPI document the schema of problems, and what a job has that is null in its example."""
     plain = app.openapi
 
     def openapi() -> dict[str, Any]:
         document = plain()
-        document["components"]["schemas"][Problem.__name__] = Problem.model_json_schema()
+        schemas = document["components"]["schemas"]
+        schemas[Problem.__name__] = Problem.model_json_schema()
+        schemas[Job.__name__]["example"] = Job.model_json_schema()["example"]  # FastAPI leaves out every null
         return document
 
     app.openapi = openapi  # type: ignore[method-assign]

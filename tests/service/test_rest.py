@@ -279,6 +279,12 @@ def test_the_openapi_document_names_the_headers_that_are_read(server: RunningSer
         assert named == headers, path
 
 
+def test_the_openapi_document_shows_a_job_with_all_that_it_has(server: RunningServer) -> None:
+    job = json.loads(curl(f"{server.url}/openapi.json").body)["components"]["schemas"]["Job"]
+    assert set(job["example"]) == set(job["required"])
+    assert job["example"]["result"] is None
+
+
 def test_the_openapi_document_says_the_limits_of_numbers(server: RunningServer) -> None:
     paths = json.loads(curl(f"{server.url}/openapi.json").body)["paths"]
     for path, name, least, most in (("/jobs", "limit", 1, 200), ("/jobs/{id}", "wait", 0, 60)):
