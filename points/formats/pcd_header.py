@@ -14,6 +14,7 @@ from straightpcf.points.formats.text import shown
 __all__ = ["PcdField", "PcdHeader", "read_header"]
 
 MAX_HEADER_BYTES = 1 << 20
+MAX_FIELDS = 4096
 MAX_COUNT = 1 << 20
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
@@ -118,6 +119,8 @@ def _fields(entries: dict[str, list[str]], axes: tuple[str, ...]) -> tuple[PcdFi
         if keyword not in entries:
             raise MalformedFile(f"the PCD header has no {keyword}{_and_unknown(entries)}")
     names = entries["FIELDS"]
+    if len(names) > MAX_FIELDS:
+        raise UnsupportedCloud(f"the PCD header has {len(names)} FIELDS; the limit is {MAX_FIELDS}")
     sizes, kinds = entries.get("SIZE", ["4"] * len(names)), entries.get("TYPE", ["F"] * len(names))
     counts = entries.get("COUNT", ["1"] * len(names))
     if not len(names) == len(sizes) == len(kinds) == len(counts):
@@ -127,11 +130,13 @@ def _fields(entries: dict[str, list[str]], axes: tuple[str, ...]) -> tuple[PcdFi
         )
     fields: list[PcdField] = []
     used: set[str] = set()
+    last: dict[str, str] = {}  # label of a name: to look again from the name on is cubic in how often it comes
     for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
-        label = name
+        label = last.get(name, name)
         while label in used:
             label += "_"
         used.add(label)
+        last[name] = label
         fields.append(_field(label, size, kind, count))
     by_label = {field.label: field for field in fields}
     for axis in axes:

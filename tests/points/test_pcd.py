@@ -219,6 +219,19 @@ def test_a_compressed_bomb_is_refused_before_memory_is_taken(tmp_path: Path) -> 
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("padding", [4093, 500_000])
+def test_a_megabyte_of_padding_fields_is_read_or_refused_at_once(padding: int, tmp_path: Path) -> None:
+    """Each is called `_`; told apart one by one, with ever longer labels, half a million never ended."""
+    head = f"FIELDS x y z{' _' * padding}\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n".encode()
+    began = time.monotonic()
+    if padding < 4096:
+        assert not _read(tmp_path, head + bytes(3 * 4 * (3 + padding))).attributes
+    else:
+        with pytest.raises(UnsupportedCloud, match="500003 FIELDS; the limit is 4096"):
+            _read(tmp_path, head)
+    assert time.monotonic() - began < 3
+
+
 def test_a_moved_value_that_float32_cannot_hold_is_named(tmp_path: Path) -> None:
     cloud = _read(tmp_path, pcd("binary"))
     with pytest.raises(UnsupportedCloud, match=r"1e\+300 does not fit into float32"):
