@@ -125,6 +125,18 @@ def test_letters_of_types_may_be_small(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", [b"ascii", b"binary"])
+def test_truth_values_as_pcl_writes_them_are_read(encoding: bytes, tmp_path: Path) -> None:
+    rows = [(1, 2, 3, 1), (4, 5, 6, 0), (7, 8, 9, 1)]
+    text = b"".join(b"%d %d %d %d\n" % row for row in rows)
+    body = text if encoding == b"ascii" else b"".join(struct.pack("<3f?", *row) for row in rows)
+    raw = HEADER.replace(b"SIZE 4 4 4 4\nTYPE F F F U", b"SIZE 4 4 4 1\nTYPE F F F B")
+    raw = raw.replace(b"ascii", encoding) + body
+    cloud = _read(tmp_path, raw)
+    assert cloud.attributes["label"].tolist() == [1, 0, 1]
+    assert _written(tmp_path, cloud.with_xyz(cloud.xyz + 1)).startswith(raw[: -len(body)])
+
+
+@pytest.mark.parametrize("encoding", [b"ascii", b"binary"])
 def test_axes_may_be_capitals(encoding: bytes, tmp_path: Path) -> None:
     body = ROWS if encoding == b"ascii" else np.arange(12, dtype="<f4").tobytes()
     raw = HEADER.replace(b"x y z label", b"X Y Z w").replace(b"F F F U", b"F F F F")
