@@ -19,7 +19,7 @@ MAX_COUNT = 1 << 20
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
 _KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
-_KINDS["B"] = ("u", (1,))  # PCL's bool, since 1.13: 0 or 1, in text as well
+_KINDS |= {"B": ("u", (1,))}  # a bool, since PCL 1.13: 0 or 1, in text as well
 
 
 @dataclass(frozen=True)

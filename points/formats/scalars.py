@@ -28,6 +28,7 @@ def scalar_columns(
     (`not_held` says which).
     """
     columns: dict[str, npt.NDArray[Any]] = {}
+    used = dict.fromkeys(taken, 1)
     for name, values in attributes.items():
         if values.dtype.kind not in "biuf":
             continue
@@ -36,7 +37,7 @@ def scalar_columns(
             kind = part.dtype.str[1:]
             wide = _held_as(kind, types)
             plain = _plain(name)
-            label = _free(plain if len(parts) == 1 else f"{plain}_{index}"[:_NAME_CHARACTERS], [*taken, *columns])
+            label = _free(plain if len(parts) == 1 else f"{plain}_{index}"[:_NAME_CHARACTERS], used)
             columns[label] = part.astype("<" + wide)
     return columns
 
@@ -46,15 +47,14 @@ def not_held(
 ) -> list[str]:
     """Name the attributes that `scalar_columns` leaves out, or whose numbers or names come out as others."""
     lost: list[str] = []
-    labels = [*taken]
+    used = dict.fromkeys(taken, 1)
     for name, values in attributes.items():
         kind, changes = values.dtype.str[1:], []
         if values.dtype.kind not in "biuf":
             lost.append(name)
             continue
-        labels.append(_free(_plain(name), labels))
-        if labels[-1] != name:
-            changes.append(f"renamed to {labels[-1]}")
+        if (label := _free(_plain(name), used)) != name:
+            changes.append(f"renamed to {label}")
         if (wide := _held_as(kind, types)) != kind:
             with np.errstate(invalid="ignore"):  # of what is beyond the type, and differs
                 again = values.astype(wide).astype(values.dtype)
@@ -80,8 +80,12 @@ def _plain(name: str) -> str:
     return plain if plain.strip("_") else "field"
 
 
-def _free(label: str, used: Collection[str]) -> str:
-    free, number = label, 2
+def _free(label: str, used: dict[str, int]) -> str:
+    """Return a label that is not used yet, numbered where it has to be, and note it; used: the last number of each."""
+    free, number = label, used.get(label, 1)
     while free in used:
-        free, number = f"{label}_{number}", number + 1
+        number += 1
+        free = f"{label}_{number}"
+    used[label] = number
+    used.setdefault(free, 1)
     return free
