@@ -20,6 +20,7 @@ from straightpcf.points.formats.text import Lines, as_integers, as_numbers, bloc
 __all__ = ["AsciiRows", "BinaryRows", "ascii_rows", "binary_rows", "scalar_offsets"]
 
 _Offsets = npt.NDArray[np.int64]
+_FEWEST_BYTES, _VALUE_BYTES = 1 << 12, 32  # of text looked at in one step, and for each value of an element
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ def ascii_rows(raw: bytes, begin: int, element: PlyElement, line: int, *, keep: 
     pieces: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in scalars}
     places: dict[str, list[tuple[_Offsets, _Offsets]]] = {name: [] for name in scalars if name in WRITTEN}
     rows_left, end = element.count, begin
-    for lines, block_end in blocks(raw, begin) if rows_left else ():
+    size = max(_FEWEST_BYTES, _VALUE_BYTES * element.count * len(element.properties))
+    for lines, block_end in blocks(raw, begin, size=size) if rows_left else ():
         # A row without properties is a blank line.
         filled = np.flatnonzero(lines.counts if element.properties else lines.counts + 1)[:rows_left]
         _walk(lines.pick(filled), element, line + filled, pieces, places)

@@ -68,20 +68,27 @@ class Lines:
 
 
 def blocks(
-    raw: bytes, begin: int, *, delimiter: bytes | None = None, longest: int | None = None
+    raw: bytes,
+    begin: int,
+    *,
+    delimiter: bytes | None = None,
+    longest: int | None = None,
+    size: int | None = None,
 ) -> Iterator[tuple[Lines, int]]:
     """Yield the lines from byte `begin` on, block by block, each with the offset where the next block begins.
 
     Lines end in LF, CRLF or a lone CR.  Without a delimiter, tokens are runs of anything but white space; with one,
     they are what stands between two delimiters, white space and quotes trimmed, and may be empty: a line of delimiters
     is no blank one. Quoted delimiters are text, in a line whose quotes come in pairs.  longest: bytes of a line that
-    does not fit into a block; raises UnsupportedCloud before memory is taken for a longer one.
+    does not fit into a block; raises UnsupportedCloud before memory is taken for a longer one.  size: bytes of a block,
+    fewer where not all of the file is wanted.
     """
+    size = min(size or BLOCK_BYTES, BLOCK_BYTES)
     while begin < len(raw):
-        end = _last_end(raw, begin, begin + BLOCK_BYTES)
+        end = _last_end(raw, begin, begin + size)
         if end == 0:
-            end = raw.find(b"\n", begin + BLOCK_BYTES - 1) + 1 or len(raw)
-            end = raw.find(b"\r", begin + BLOCK_BYTES - 1, end - 2) + 1 or end
+            end = raw.find(b"\n", begin + size - 1) + 1 or len(raw)
+            end = raw.find(b"\r", begin + size - 1, end - 2) + 1 or end
             if longest is not None and end - begin > longest:
                 raise UnsupportedCloud(f"the line at byte {begin} has {end - begin} bytes; the limit is {longest}")
         yield _split(raw, begin, end, delimiter), end

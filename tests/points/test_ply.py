@@ -14,7 +14,7 @@ import pytest
 
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import InvalidCloud, MalformedFile, TooManyPoints, UnsupportedCloud
-from straightpcf.points.formats import format_named, read_cloud, write_cloud
+from straightpcf.points.formats import format_named, read_cloud, text, write_cloud
 from tests.clouds import torus
 from tests.points.samples import SAMPLES
 
@@ -182,6 +182,26 @@ def test_a_header_of_very_many_lines_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(MalformedFile):
         read(tmp_path, raw)
     assert time.process_time() - began < 1.5  # 0.3 s; 3 s when each line was looked for in a copy of 64 KiB
+
+
+def test_small_elements_of_text_are_taken_apart_without_the_vertices_behind_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each had up to eight megabytes taken apart into tokens, for its one row."""
+    small = [line for number in range(100) for line in (f"element e{number} 1", "property float a")]
+    raw = header(ASCII, *small, "element vertex 100000", *AXES) + b"\n7\n" * 100 + b"1 2 3\n" * 100_000
+    split, taken_apart = text._split, []
+
+    def counted(raw: bytes, begin: int, end: int, delimiter: bytes | None) -> text.Lines:
+        taken_apart.append(end - begin)
+        return split(raw, begin, end, delimiter)
+
+    monkeypatch.setattr(text, "_split", counted)
+    cloud = read(tmp_path, raw)
+    assert sum(taken_apart) < 2 * len(raw)
+    xyz = cloud.xyz.copy()
+    xyz[-1] = 4, 5, 6
+    assert written(tmp_path, cloud.with_xyz(xyz)) == raw[: -len(b"1 2 3\n")] + b"4.0 5.0 6.0\n"
 
 
 @pytest.mark.parametrize("counter", ["uchar", "int"])
