@@ -58,13 +58,18 @@ class PointCloud:
         with np.errstate(invalid="ignore"):
             return np.stack([self.attributes[name].astype(np.float64) for name in self.normal_names], axis=1)
 
-    def new_attributes(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the attributes as a new file is to have them: with the new normals, if there are any."""
-        if self.normals is None:
-            return dict(self.attributes)
-        columns = zip(self.normal_names, self.normals.T, strict=True)
-        new = {name: values.astype(self.attributes[name].dtype) for name, values in columns}
-        return {**self.attributes, **new}
+    def new_attributes(self, normals: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
+        """Return the attributes as a new file is to have them: with the new normals, if there are any.
+
+        normals: what its format calls them; others would be columns of numbers to its readers.
+        """
+        new = dict(self.attributes)
+        if self.normals is not None:
+            columns = zip(self.normal_names, self.normals.T, strict=True)
+            new |= {name: values.astype(self.attributes[name].dtype) for name, values in columns}
+        free = not {*normals} & {*new}
+        called = dict(zip(self.normal_names, normals, strict=False)) if free else {}
+        return {called.get(name, name): values for name, values in new.items()}
 
     def with_normals(self, normals: npt.NDArray[np.float64]) -> PointCloud:
         """Return the same cloud with other normals, (N, 3) float64; it must have some."""

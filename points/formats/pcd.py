@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room, check_unpacked
@@ -230,7 +230,7 @@ def _new_file(cloud: PointCloud) -> bytes:
     """Write a binary file with positions and every attribute as fields of one value."""
     kind = _position_type(cloud.xyz)
     columns = {axis: cloud.xyz[:, column].astype(kind) for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(packed(cloud.new_attributes()), _TYPES, taken=AXES)
+    columns |= scalar_columns(packed(cloud.new_attributes(NORMALS[1])), _TYPES, taken=AXES)
     table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import in_8_bits
@@ -190,7 +190,7 @@ def _patched(
 def _new_file(cloud: PointCloud) -> bytes:
     """Write binary little-endian with double positions and every attribute as scalar properties."""
     columns = {axis: cloud.xyz[:, column] for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(in_8_bits(cloud.new_attributes()), _NAMES, taken=AXES)
+    columns |= scalar_columns(in_8_bits(cloud.new_attributes(NORMALS[0])), _NAMES, taken=AXES)
     lines = ["ply", "format binary_little_endian 1.0", "comment written by straightpcf", f"element vertex {len(cloud)}"]
     lines += [f"property {_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
     table = np.empty(len(cloud), [(name, "<" + values.dtype.str[1:]) for name, values in columns.items()])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.formats import format_named, read_cloud, write_cloud
 
 N = 50
@@ -85,8 +85,27 @@ def test_another_format_gets_the_new_normals_too(tmp_path: Path) -> None:
     cloud, _ = read_cloud(source)
     write_cloud(cloud.with_normals(NEW), tmp_path / "cloud.pcd", format_named("pcd"))
     back, _ = read_cloud(tmp_path / "cloud.pcd")
-    assert back.normal_names == ("nx", "ny", "nz")
+    assert back.normal_names == ("normal_x", "normal_y", "normal_z")
     np.testing.assert_allclose(back.old_normals(), NEW, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("target", "called"), [("ply", ("nx", "ny", "nz")), ("pcd", ("normal_x", "normal_y", "normal_z"))]
+)
+@pytest.mark.parametrize("names", NORMALS)
+def test_a_new_file_calls_normals_as_its_readers_do(
+    names: tuple[str, ...], target: str, called: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Open3D and PCL read normal_x from PCD alone, Open3D and MeshLab nx from PLY."""
+    columns = dict(zip(names, OLD.T, strict=True))
+    cloud = PointCloud(XYZ.astype(np.float64), {"label": np.arange(N), **columns})
+    write_cloud(cloud, out := tmp_path / f"new.{target}", format_named(target))
+    back, _ = read_cloud(out)
+    assert [*back.attributes] == ["label", *called]
+    np.testing.assert_array_equal(back.old_normals(), OLD)
+    both = PointCloud(cloud.xyz, dict(zip((*NORMALS[0], *NORMALS[1]), (*OLD.T, *NEW.T), strict=True)))
+    write_cloud(both, out, format_named(target))
+    assert [*read_cloud(out)[0].attributes] == [*NORMALS[0], *NORMALS[1]]
 
 
 def test_a_cloud_without_normals_takes_none() -> None:
