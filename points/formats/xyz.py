@@ -37,7 +37,7 @@ _LOOKED_AT = 1 << 14  # bytes of the first rows, which tell decimal commas from 
 # Three numbers or more, each of two cells between commas: 0,5, 1,5, 2,5.
 _PAIRS = re.compile(rb"\s*[+-]?\d+,\d+(?:,\s*[+-]?\d+,\d+){2,}\s*")
 _TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
-_WHOLE = np.dtype(np.int64)
+_WHOLE, _UNSIGNED = np.dtype(np.int64), np.dtype(np.uint64)
 _Offsets = npt.NDArray[np.int64]
 
 
@@ -81,7 +81,7 @@ class Xyz(Format):
         return False
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
-        """Read the table; further columns that hold numbers become float64 attributes, or int64 where they need to."""
+        """Read the table; further columns of numbers become float64 attributes, int64 or uint64 where they need to."""
         raw = path.read_bytes()
         refuse_binary(raw, 0)
         layout = read_layout(raw, self.marks)
@@ -290,24 +290,28 @@ def _is_beyond_doubles(values: npt.NDArray[np.float64]) -> bool:
     return bool(np.isfinite(values).all() and (np.abs(values) >= 2**53).any() and (values == np.rint(values)).all())
 
 
-def _whole(
-    table: Lines, token: npt.NDArray[np.int64], values: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64] | npt.NDArray[np.int64]:
-    """Read (K,) tokens again as int64; their values as they are where one is larger than that."""
-    exact, bad = as_integers(table.raw, table.starts[token], table.ends[token], _WHOLE)
-    return exact if bad is None else values
+def _whole(table: Lines, token: npt.NDArray[np.int64], values: npt.NDArray[np.float64]) -> npt.NDArray[Any]:
+    """Read (K,) tokens again as int64, or uint64: hashes; their values as they are where some fit into neither."""
+    for kind in (_WHOLE, _UNSIGNED):
+        exact, bad = as_integers(table.raw, table.starts[token], table.ends[token], kind)
+        if bad is None:
+            return exact
+    return values
 
 
 def _joined(parts: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-    """Join the blocks of a column: int64 where one is and the others can be, else float64."""
-    has_whole = any(part.dtype == _WHOLE for part in parts)
-    if has_whole and all(part.dtype == _WHOLE or _is_whole(part) for part in parts):
-        return np.concatenate([part.astype(_WHOLE) for part in parts])
+    """Join the blocks of a column: int64 or uint64 where one is and the others can be, else float64."""
+    kinds = {part.dtype for part in parts}
+    kind = next((kind for kind in (_UNSIGNED, _WHOLE) if kind in kinds), None)
+    if kind is not None and all(_can_be(kind, part) for part in parts):
+        return np.concatenate([part.astype(kind) for part in parts])
     return np.concatenate([part.astype(np.float64) for part in parts])
 
 
-def _is_whole(part: npt.NDArray[np.float64]) -> bool:
-    return bool((np.abs(part) < 2**53).all() and (part == np.rint(part)).all())
+def _can_be(kind: np.dtype[Any], part: npt.NDArray[Any]) -> bool:
+    if part.dtype.kind == "f" and not ((np.abs(part) < 2**53) & (part == np.rint(part))).all():
+        return False
+    return kind == _WHOLE or bool((part >= 0).all())
 
 
 def _is_row(lines: Lines) -> npt.NDArray[np.bool_]:

@@ -296,6 +296,21 @@ def test_every_kind_of_line_end_falls_anywhere_in_a_block(tmp_path: Path, monkey
             assert read(tmp_path, raw).xyz[:, 0].tolist() == [10**row for row in range(12)]
 
 
+@pytest.mark.parametrize("size", [20, 1 << 20])
+def test_hashes_of_64_bits_are_read_to_the_last_digit(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those above 2**63 became the nearest float64, and arrived so in every other format, without a word."""
+    monkeypatch.setattr(text, "BLOCK_BYTES", size)
+    hashes = [2**64 - 1, 7, 2**53 + 1, 2**63 + 1]
+    rows = [f"1,2,3,{number},{-number},{number % 8}.5" for number in hashes]
+    cloud = read(tmp_path, "\n".join(["x,y,z,hash,below,half", *rows]).encode())
+    assert [cloud.attributes[name].dtype for name in ("hash", "below", "half")] == [np.uint64, np.float64, np.float64]
+    assert cloud.attributes["hash"].tolist() == hashes
+    signed = read(tmp_path, b"x,y,z,a\n1,2,3,18446744073709551615\n1,2,3,-1\n")
+    assert signed.attributes["a"].tolist() == [2.0**64, -1]
+
+
 def test_a_few_long_remarks_take_no_more_memory_than_many(tmp_path: Path) -> None:
     remarks = (b"9" * (390 if row % 1000 == 0 else 5) for row in range(65_536))
     raw = b"x,y,z,w\n" + b"".join(b"%d,1.25,2.5,%b\n" % row for row in enumerate(remarks))
