@@ -24,7 +24,7 @@ from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
 from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
-from straightpcf.model.spread import TANGENT_NEIGHBOURS, spread_among
+from straightpcf.model.spread import ROUNDS, TANGENT_NEIGHBOURS, spread_among
 from straightpcf.model.survey import survey_on
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
@@ -172,14 +172,15 @@ class OnDevice:
         return distances
 
     @torch.inference_mode()
-    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int = ROUNDS) -> Floats:
         """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before.
 
         Raises TooLarge where it has no memory for them.
         """
         with current(self.device), enough_memory(self.device, len(positions)):
             points = torch.from_numpy(positions).to(self.device)
-            moved: Floats = spread_among(points, self._around(points, tiling, TANGENT_NEIGHBOURS), limit).cpu().numpy()
+            around = self._around(points, tiling, TANGENT_NEIGHBOURS)
+            moved: Floats = spread_among(points, around, limit, rounds=rounds).cpu().numpy()
         return moved
 
     @torch.inference_mode()

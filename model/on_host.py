@@ -15,7 +15,7 @@ import torch
 from straightpcf.model.agreement import Agreement
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
-from straightpcf.model.spread import spread
+from straightpcf.model.spread import ROUNDS, spread
 from straightpcf.model.survey import survey
 from straightpcf.model.tiles import Tiling
 
@@ -82,11 +82,12 @@ class OnHost:
 
         return np.array(list(self.mapper(read, range(len(cut.seeds)))))
 
-    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int = ROUNDS) -> Floats:
         """Spread tile by tile, the halo around."""
         moved = np.empty_like(positions)
         for rows, own in tiling.surroundings():
-            moved[rows[:own]] = spread(positions[rows], limit, workers=self._threads, mapper=self.mapper)[:own]
+            near = spread(positions[rows], limit, rounds=rounds, workers=self._threads, mapper=self.mapper)
+            moved[rows[:own]] = near[:own]
         return moved
 
     def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> None:

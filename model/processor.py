@@ -82,7 +82,7 @@ class Processor(Protocol):
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
         """Do what a `model.survey.Survey` does."""
 
-    def spread(self, positions: Floats, tiling: Tiling, limit: float) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int) -> Floats:
         """Return what `model.spread.spread` does; tiling: of the pass before."""
 
 

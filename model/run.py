@@ -17,6 +17,7 @@ from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
+from straightpcf.model.spread import rounds_of
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
 from straightpcf.points.cloud import as_positions
@@ -223,8 +224,9 @@ class Run:
         if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].sampling.irregular:
             return 0.0
         first = self.readings[0]
-        limit = _SPREAD_LIMIT * min(first.noise_std, first.sampling.noise_of_most)
-        return self.filter.processor.spread(positions, tiling, limit)
+        noise = min(first.noise_std, first.sampling.noise_of_most)
+        rounds = rounds_of(noise, first.sampling.hiding_share)
+        return self.filter.processor.spread(positions, tiling, _SPREAD_LIMIT * noise, rounds)
 
     def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all

@@ -12,7 +12,7 @@ from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats
 from straightpcf.model.survey import Survey, survey
-from straightpcf.model.walls import has_walls, may_hide_walls, midway_shares
+from straightpcf.model.walls import WALL_PATCHES_SHARE, has_walls, hiding_share, midway_shares
 
 __all__ = ["Sampling"]
 
@@ -39,15 +39,15 @@ class Sampling:
 
     irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
-    hides_walls: whether noise may hide such; uncovered: whether a pass has taken most of it, and walls that it hid were
-    looked for; noise_of_most: the noise std of most points, where a few have so much more that theirs is what is read
-    of all, else infinite.
+    hiding_share: of their patches, in which noise may hide such; uncovered: whether a pass has taken most of it, and
+    walls that it hid were looked for; noise_of_most: the noise std of most points, where a few have so much more that
+    theirs is what is read of all, else infinite.
     """
 
     irregular: bool = False
     low_noise: float = 0.0
     thin_walls: bool = False
-    hides_walls: bool = False
+    hiding_share: float = 0.0
     uncovered: bool = False
     noise_of_most: float = np.inf
 
@@ -69,12 +69,12 @@ class Sampling:
         enough = patches.index.shape[1] >= _LEAST_PATCH_POINTS
         irregular = enough and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
-        return cls(irregular, low_noise, thin_walls, hides_walls=may_hide_walls(shares), noise_of_most=noise_of_most)
+        return cls(irregular, low_noise, thin_walls, hiding_share=hiding_share(shares), noise_of_most=noise_of_most)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, survey: Survey = survey) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
         thin_walls = self.thin_walls
-        if self.hides_walls and not thin_walls:
+        if self.hiding_share > WALL_PATCHES_SHARE and not thin_walls:
             thin_walls = has_walls(np.concatenate(list(survey(xyz, patches, midway_shares))), uncovered=True)
         return replace(self, thin_walls=thin_walls, uncovered=True)
 

@@ -11,10 +11,13 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.processor import Floats, Mapper
 
-__all__ = ["TANGENT_NEIGHBOURS", "spread", "spread_among"]
+__all__ = ["ROUNDS", "TANGENT_NEIGHBOURS", "rounds_of", "spread", "spread_among"]
 
 TANGENT_NEIGHBOURS = 16  # of which the tangent plane is taken
-_ROUNDS = 2
+# The more evenly points lie, the more the network believes in layers of them: of two walls or, where noise is as strong
+# as it knows it, of one surface. Fewer rounds where hardly any patch may hide walls, more where many may.
+ROUNDS, _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_HIDDEN_WALLS = 2, 1, 4
+_STRONG_NOISE, _HARDLY_HIDING, _MOSTLY_HIDING = 0.025, 0.18, 0.4
 _PUSH_SHARE = 0.2  # of the mean distance to these, what a round moves by
 _PUSHING_NEIGHBOURS = 8
 # The length of the mean direction to a point's neighbours: 0 where they are all around, 0.64 on a straight border.
@@ -23,22 +26,35 @@ _CHUNKS = {"cpu": 1 << 12, "cuda": 1 << 15}  # points at once: what the cache ho
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def spread(xyz: Floats, limit: float, *, workers: int = 1, mapper: Mapper = map) -> Floats:
+def rounds_of(noise_std: float, hiding_share: float) -> int:
+    """Return in how many rounds an object's points are spread.
+
+    noise_std: in the unit ball; hiding_share: of the patches, in which it may hide walls (`Sampling`).
+    """
+    if noise_std < _STRONG_NOISE or _HARDLY_HIDING < hiding_share < _MOSTLY_HIDING:
+        return ROUNDS
+    return _ROUNDS_OF_HIDDEN_WALLS if hiding_share > _HARDLY_HIDING else _ROUNDS_OF_ONE_SURFACE
+
+
+def spread(xyz: Floats, limit: float, *, rounds: int = ROUNDS, workers: int = 1, mapper: Mapper = map) -> Floats:
     """Return how far each of the points (N, 3) goes to be farther from its nearest ones: (N, 3), along the surface.
 
     Noise moves points along a surface as far as across it, and leaves them in clumps and gaps that no clean cloud has;
     where each came from cannot be known, but that they were apart can. A weighted repulsion in the tangent plane, as in
     LOP (Lipman et al. 2007, "Parameterization-free projection for geometry reconstruction"). limit: the farthest that
-    any goes, in the unit of xyz. Points of a border, whose neighbours are all on one side, stay. workers: threads that
-    look up neighbours; mapper: calls a function with chunks of the points, in any order, on threads if it has some.
+    any goes, in the unit of xyz; rounds: how often all are pushed (`rounds_of`). Points of a border, whose neighbours
+    are all on one side, stay. workers: threads that look up neighbours; mapper: calls a function with chunks of the
+    points, in any order, on threads if it has some.
     """
     _, index = cKDTree(xyz).query(xyz, k=min(TANGENT_NEIGHBOURS, len(xyz) - 1) + 1, workers=workers)
     around = torch.from_numpy(index[:, 1:].astype(np.int32))
-    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit, mapper=mapper).numpy()
+    moved: Floats = spread_among(torch.from_numpy(xyz), around, limit, rounds=rounds, mapper=mapper).numpy()
     return moved
 
 
-def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, mapper: Mapper = map) -> torch.Tensor:
+def spread_among(
+    xyz: torch.Tensor, around: torch.Tensor, limit: float, *, rounds: int = ROUNDS, mapper: Mapper = map
+) -> torch.Tensor:
     """Do what `spread` does for points (N, 3) float64 on any device.
 
     around: (N, k) rows of each point's nearest others, nearest first.
@@ -70,7 +86,7 @@ def spread_among(xyz: torch.Tensor, around: torch.Tensor, limit: float, *, mappe
     # as long where another process has one of the cores.
     _all(mapper(look, chunks))
     here = xyz
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         there = torch.empty_like(xyz)
         _all(mapper(partial(push, here, there), chunks))
         here = there

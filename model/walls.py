@@ -14,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["has_walls", "may_hide_walls", "midway_shares", "share_between_walls"]
+__all__ = ["WALL_PATCHES_SHARE", "has_walls", "hiding_share", "midway_shares", "share_between_walls"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -27,7 +27,7 @@ _QUADRIC_FROM = 64
 # cloud's patches, so it has walls where that is so of a fifth of them.
 _MIDWAY_STDS = 0.5
 _WALLS_MIDWAY_SHARE, _MAYBE_WALLS_MIDWAY_SHARE = 0.27, 0.28
-_WALL_PATCHES_SHARE = 0.2
+WALL_PATCHES_SHARE = 0.2
 # Where a pass has taken the noise of one surface, what still has height has walls: more neighbours may lie midway.
 _UNCOVERED_MIDWAY_SHARE = 0.33
 # A pass may leave one surface, a flat sheet, in two layers, which look so, too. Before it of the nearest 64 of a sheet
@@ -140,12 +140,12 @@ def has_walls(shares: Floats, *, uncovered: bool = False) -> bool:
     uncovered: whether a pass has taken the noise of what is one surface.
     """
     few = _UNCOVERED_MIDWAY_SHARE if uncovered else _MAYBE_WALLS_MIDWAY_SHARE
-    return bool((shares < few).mean(axis=0).max() > _WALL_PATCHES_SHARE)
+    return bool((shares < few).mean(axis=0).max() > WALL_PATCHES_SHARE)
 
 
-def may_hide_walls(shares: Floats) -> bool:
-    """Say whether the noise of a cloud may hide such walls; shares: as of `has_walls`."""
-    return bool((shares[:, 1] < _HIDDEN_MIDWAY_SHARE).mean() > _WALL_PATCHES_SHARE)
+def hiding_share(shares: Floats) -> float:
+    """Return the share of a cloud's patches whose noise may hide such walls, 0..1; shares: as of `has_walls`."""
+    return float((shares[:, 1] < _HIDDEN_MIDWAY_SHARE).mean())
 
 
 def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False, by_chance: bool = False) -> float:
