@@ -16,6 +16,8 @@ __all__ = ["Calibration"]
 # d of noise that one pass takes most of: little, and what leaves more of thin bodies (1.5 to 2 %).
 _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
 _STUCK_WITH_MORE_NOISE = 0.7  # as `stuck`, of d between those two where no walls were seen
+# d says little of walls that a pass has begun to part: each of the next ones parts them farther.
+_PASSES_OF_SHOWN_WALLS = 4
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,22 @@ class Calibration:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
 
-    def passes_left(self, distances: Sequence[float], noise_in_radii: float = 0.0, *, thin_walls: bool = False) -> int:
+    def passes_left(
+        self,
+        distances: Sequence[float],
+        noise_in_radii: float = 0.0,
+        *,
+        thin_walls: bool = False,
+        shown_walls: bool = False,
+    ) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
         distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`;
-        thin_walls: whether points seemed to be on walls close together before the first pass.
+        thin_walls: whether points seemed to be on walls close together before the first pass; shown_walls: whether they
+        seem to be since, where strong noise hid them.
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
-        due = 1 + sum(start > limit for limit in self.starts)
+        due = max(1 + sum(start > limit for limit in self.starts), _PASSES_OF_SHOWN_WALLS if shown_walls else 1)
         little = thin_walls or start < _LITTLE_NOISE_DISTANCE
         stuck = self.stuck if little else max(self.stuck, _STUCK_WITH_MORE_NOISE)
         if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:

@@ -17,7 +17,7 @@ from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
-from straightpcf.model.spread import rounds_of
+from straightpcf.model.spread import ROUNDS
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
 from straightpcf.points.cloud import as_positions
@@ -102,6 +102,7 @@ class Run:
         self.held_back = np.zeros(len(self.moved), dtype=bool)
         self.voxel = 0.0  # the edge of a cell, in the unit-ball frame, where the points are a bent surface's voxels
         self.readings: list[Reading] = []  # before each pass, and after the last
+        self._rounds = ROUNDS  # of spreading, before each pass but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
@@ -210,8 +211,12 @@ class Run:
         if len(self.points.xyz) < _FEW_POINTS:
             return 1 - self.iterations
         first = self.readings[0]
-        thin_walls = first.sampling.thin_walls
-        return self.filter.calibration.passes_left(self.distances, first.noise_in_radii, thin_walls=thin_walls)
+        return self.filter.calibration.passes_left(
+            self.distances,
+            first.noise_in_radii,
+            thin_walls=first.sampling.thin_walls,
+            shown_walls=self._rounds > ROUNDS,
+        )
 
     def _spread_step(
         self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
@@ -223,10 +228,11 @@ class Run:
         """
         if tiling is None or not self.filter.even or self.iterations == planned or self.readings[-1].sampling.irregular:
             return 0.0
-        first = self.readings[0]
+        first, processor = self.readings[0], self.filter.processor
         noise = min(first.noise_std, first.sampling.noise_of_most)
-        rounds = rounds_of(noise, first.sampling.hiding_share)
-        return self.filter.processor.spread(positions, tiling, _SPREAD_LIMIT * noise, rounds)
+        if self.iterations == 1 and first.probes is not None:
+            self._rounds = first.sampling.spread_rounds(positions, first.probes, noise, survey=processor.survey)
+        return processor.spread(positions, tiling, _SPREAD_LIMIT * noise, self._rounds)
 
     def _pass(self, positions: npt.NDArray[np.float64], tiling: Tiling, left: int) -> Iterator[FinishedPatch]:
         begun_at, share = self._progress, (1 - self._progress) / left  # so it never falls, however many come after all

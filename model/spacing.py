@@ -11,8 +11,9 @@ from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats
+from straightpcf.model.spread import ROUNDS
 from straightpcf.model.survey import Survey, survey
-from straightpcf.model.walls import WALL_PATCHES_SHARE, has_walls, hiding_share, midway_shares
+from straightpcf.model.walls import WALL_PATCHES_SHARE, has_walls, hiding_share, midway_shares, showing_share
 
 __all__ = ["Sampling"]
 
@@ -30,6 +31,11 @@ _LINES_AREA_RATIO = 1.3
 # Where so many points are far off their neighbours' surface, and what was read is so many times the noise of the
 # others, it is the noise of those few.
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
+# The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise (its std in
+# the unit ball) is as strong as any that it was trained on, in two of one surface. So there points are spread in fewer
+# rounds where hardly any patch may hide walls, in more where many show them after the first pass.
+_STRONG_NOISE, _HARDLY_HIDING_SHARE, _SHOWING_SHARE = 0.025, 0.18, 0.35
+_ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_WALLS = 1, 4
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
 
 
@@ -77,6 +83,18 @@ class Sampling:
         if self.hiding_share > WALL_PATCHES_SHARE and not thin_walls:
             thin_walls = has_walls(np.concatenate(list(survey(xyz, patches, midway_shares))), uncovered=True)
         return replace(self, thin_walls=thin_walls, uncovered=True)
+
+    def spread_rounds(self, xyz: Floats, patches: Patches, noise_std: float, *, survey: Survey = survey) -> int:
+        """Return in how many rounds points with noise of some std in the unit ball are spread (`model.spread`).
+
+        xyz: (N, 3), as the first pass has left them.
+        """
+        if noise_std < _STRONG_NOISE:
+            return ROUNDS
+        if self.hiding_share < _HARDLY_HIDING_SHARE:
+            return _ROUNDS_OF_ONE_SURFACE
+        shares = np.concatenate(list(survey(xyz, patches, midway_shares)))
+        return _ROUNDS_OF_WALLS if showing_share(shares) > _SHOWING_SHARE else ROUNDS
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,10 @@ from scipy.spatial import cKDTree
 
 from straightpcf.model.processor import Floats, Mapper
 
-__all__ = ["ROUNDS", "TANGENT_NEIGHBOURS", "rounds_of", "spread", "spread_among"]
+__all__ = ["ROUNDS", "TANGENT_NEIGHBOURS", "spread", "spread_among"]
 
 TANGENT_NEIGHBOURS = 16  # of which the tangent plane is taken
-# The more evenly points lie, the more the network believes in layers of them: of two walls or, where noise is as strong
-# as it knows it, of one surface. Fewer rounds where hardly any patch may hide walls, more where many may.
-ROUNDS, _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_HIDDEN_WALLS = 2, 1, 4
-_STRONG_NOISE, _HARDLY_HIDING, _MOSTLY_HIDING = 0.025, 0.18, 0.4
+ROUNDS = 2  # but where noise is strong: `Sampling.spread_rounds`
 _PUSH_SHARE = 0.2  # of the mean distance to these, what a round moves by
 _PUSHING_NEIGHBOURS = 8
 # The length of the mean direction to a point's neighbours: 0 where they are all around, 0.64 on a straight border.
@@ -26,23 +23,13 @@ _CHUNKS = {"cpu": 1 << 12, "cuda": 1 << 15}  # points at once: what the cache ho
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def rounds_of(noise_std: float, hiding_share: float) -> int:
-    """Return in how many rounds an object's points are spread.
-
-    noise_std: in the unit ball; hiding_share: of the patches, in which it may hide walls (`Sampling`).
-    """
-    if noise_std < _STRONG_NOISE or _HARDLY_HIDING < hiding_share < _MOSTLY_HIDING:
-        return ROUNDS
-    return _ROUNDS_OF_HIDDEN_WALLS if hiding_share > _HARDLY_HIDING else _ROUNDS_OF_ONE_SURFACE
-
-
 def spread(xyz: Floats, limit: float, *, rounds: int = ROUNDS, workers: int = 1, mapper: Mapper = map) -> Floats:
     """Return how far each of the points (N, 3) goes to be farther from its nearest ones: (N, 3), along the surface.
 
     Noise moves points along a surface as far as across it, and leaves them in clumps and gaps that no clean cloud has;
     where each came from cannot be known, but that they were apart can. A weighted repulsion in the tangent plane, as in
     LOP (Lipman et al. 2007, "Parameterization-free projection for geometry reconstruction"). limit: the farthest that
-    any goes, in the unit of xyz; rounds: how often all are pushed (`rounds_of`). Points of a border, whose neighbours
+    any goes, in the unit of xyz; rounds: how often all are pushed. Points of a border, whose neighbours
     are all on one side, stay. workers: threads that look up neighbours; mapper: calls a function with chunks of the
     points, in any order, on threads if it has some.
     """

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["WALL_PATCHES_SHARE", "has_walls", "hiding_share", "midway_shares", "share_between_walls"]
+__all__ = ["WALL_PATCHES_SHARE", "has_walls", "hiding_share", "midway_shares", "share_between_walls", "showing_share"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -146,6 +146,11 @@ def has_walls(shares: Floats, *, uncovered: bool = False) -> bool:
 def hiding_share(shares: Floats) -> float:
     """Return the share of a cloud's patches whose noise may hide such walls, 0..1; shares: as of `has_walls`."""
     return float((shares[:, 1] < _HIDDEN_MIDWAY_SHARE).mean())
+
+
+def showing_share(shares: Floats) -> float:
+    """Return the share of a cloud's patches in which a pass has uncovered such walls; shares: as of `has_walls`."""
+    return float((shares[:, 1] < _UNCOVERED_MIDWAY_SHARE).mean())
 
 
 def share_between_walls(step: Floats, patch: Floats, *, uncovered: bool = False, by_chance: bool = False) -> float:
