@@ -33,8 +33,9 @@ _LINES_AREA_RATIO = 1.3
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
 # The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise (its std in
 # the unit ball) is as strong as any that it was trained on, in two of one surface. So there points are spread in fewer
-# rounds where hardly any patch may hide walls, in more where many show them after the first pass.
-_STRONG_NOISE, _HARDLY_HIDING_SHARE, _SHOWING_SHARE = 0.025, 0.18, 0.35
+# rounds where hardly any patch may hide walls, in more where many may and many show them after the first pass: the sum
+# of the first share and twice the second is 0.84 and less of bodies and lattices, 1.06 and more of thin walls.
+_STRONG_NOISE, _HARDLY_HIDING_SHARE, _HIDING_AND_SHOWING = 0.025, 0.18, 0.95
 _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_WALLS = 1, 4
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
 
@@ -94,7 +95,8 @@ class Sampling:
         if self.hiding_share < _HARDLY_HIDING_SHARE:
             return _ROUNDS_OF_ONE_SURFACE
         shares = np.concatenate(list(survey(xyz, patches, midway_shares)))
-        return _ROUNDS_OF_WALLS if showing_share(shares) > _SHOWING_SHARE else ROUNDS
+        walls = self.hiding_share + 2 * showing_share(shares) > _HIDING_AND_SHOWING
+        return _ROUNDS_OF_WALLS if walls else ROUNDS
 
 
 @dataclass(frozen=True)

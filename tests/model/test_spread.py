@@ -32,6 +32,12 @@ def test_clumps_are_spread_along_the_surface_and_not_off_it() -> None:
     assert abs(height.mean()) < 0.02 * np.linalg.norm(moved, axis=1).mean()
 
 
+def test_each_round_leaves_them_more_even() -> None:
+    ball = sphere(4000, 0)
+    left = [unevenness(ball + spread(ball, limit=1.0, rounds=rounds)) for rounds in (1, 2, 4)]
+    assert unevenness(ball) > left[0] > left[1] > left[2]
+
+
 def test_no_point_goes_farther_than_the_limit() -> None:
     ball = sphere(2000, 0)
     far = np.linalg.norm(spread(ball, limit=0.003), axis=1)
@@ -71,9 +77,11 @@ def test_few_points_and_points_in_a_line_are_borne(count: int) -> None:
 def test_the_filter_spreads_between_passes_only(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
 
-    def counted(xyz: npt.NDArray[np.float64], limit: float, *, workers: int, mapper: Mapper) -> npt.NDArray[np.float64]:
+    def counted(
+        xyz: npt.NDArray[np.float64], limit: float, *, rounds: int, workers: int, mapper: Mapper
+    ) -> npt.NDArray[np.float64]:
         calls.append(limit)
-        return spread(xyz, limit, workers=workers, mapper=mapper)
+        return spread(xyz, limit, rounds=rounds, workers=workers, mapper=mapper)
 
     monkeypatch.setattr("straightpcf.model.on_host.spread", counted)
     model = Filter(StraightPCF(), threads=1)
