@@ -42,6 +42,13 @@ def test_a_cloud_gets_the_passes_that_its_distances_ask_for(distances: tuple[flo
     assert passes(Calibration(), trace(0.0, *distances)) == made
 
 
+def test_walls_that_a_pass_shows_get_four_passes() -> None:
+    of_walls = (0.90, 0.57, 0.46, 0.44)
+    assert Calibration().passes_left(of_walls) == 0
+    assert Calibration().passes_left(of_walls, shown_walls=True) > 0
+    assert Calibration().passes_left((*of_walls, 0.43), shown_walls=True) == 0
+
+
 def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> None:
     distances = (0.58, 0.19, 0.12, 0.12, 0.12)
     few, dense = Trace("few", 0.01, distances, ()), Trace("dense", 0.01, distances, (), noise_in_radii=0.06)

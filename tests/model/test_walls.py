@@ -133,6 +133,20 @@ def test_noise_may_hide_walls_but_not_in_a_sheet(count: int) -> None:
         assert (seen.thin_walls, seen.hiding_share > WALL_PATCHES_SHARE) == (False, hides)
 
 
+def test_strong_noise_has_few_rounds_of_spreading_on_one_surface_and_many_where_it_hides_walls() -> None:
+    ball, walls = even_sphere(8000), even_plate(4000, 0.03)
+    for clean, noise_std, left, rounds in [(ball, 0.03, 0.006, 1), (ball, 0.015, 0.006, 2), (walls, 0.012, 0.006, 4)]:
+        rough, passed = noisy(clean, noise_std), noisy(clean, left, seed=2)
+        patches = cut_patches(rough, coverage=3.0, seed=0)
+        in_unit_ball = noise_std if clean is ball else 0.03
+        seen = Sampling.of(rough, patches, noise_std)
+        assert seen.spread_rounds(passed, patches, in_unit_ball) == rounds
+        assert seen.spread_rounds(passed, patches, 0.02) == 2
+    some = replace(seen, hiding_share=0.4)  # where only some patches may hide walls, a pass has to show them
+    assert some.spread_rounds(noisy(walls, 0.006, seed=2), patches, 0.03) == 4
+    assert some.spread_rounds(noisy(even_plate(4000, 0.0), 0.006, seed=2), patches, 0.03) == 2
+
+
 def pipe(count: int, seed: int = 0) -> np.ndarray:
     """Return points (count, 3) that lie by chance on an open pipe of radius 0.5 and wall 0.1, 1.6 long."""
     rng = np.random.default_rng(seed)
