@@ -9,6 +9,7 @@ import numpy as np
 from straightpcf.model.arrays import on_host
 from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
 from straightpcf.model.neighbourhoods import Nearest
+from straightpcf.model.normalize import HIGH_NOISE
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats
 from straightpcf.model.spread import ROUNDS
@@ -31,10 +32,11 @@ _LINES_AREA_RATIO = 1.3
 # Where so many points are far off their neighbours' surface, and what was read is so many times the noise of the
 # others, it is the noise of those few.
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
-# The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise (its std in
-# the unit ball) is as strong as any that it was trained on, in two of one surface. So there points are spread in fewer
-# rounds where hardly any patch may hide walls, in more where many may and many show them after the first pass: the sum
-# of the first share and twice the second is 0.84 and less of bodies and lattices, 1.06 and more of thin walls.
+# The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise is above what
+# it was trained on (HIGH_NOISE), in two of one surface. So points are spread in fewer rounds where that is and hardly
+# any patch may hide walls. They are in more where noise (its std in the unit ball) is strong, many patches may hide walls
+# and many show them after the first pass: the sum of the first share and twice the second is 0.84 and less of bodies
+# and lattices, 1.06 and more of thin walls.
 _STRONG_NOISE, _HARDLY_HIDING_SHARE, _HIDING_AND_SHOWING = 0.025, 0.18, 0.95
 _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_WALLS = 1, 4
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
@@ -93,7 +95,7 @@ class Sampling:
         if noise_std < _STRONG_NOISE:
             return ROUNDS
         if self.hiding_share < _HARDLY_HIDING_SHARE:
-            return _ROUNDS_OF_ONE_SURFACE
+            return _ROUNDS_OF_ONE_SURFACE if noise_std > HIGH_NOISE else ROUNDS
         shares = np.concatenate(list(survey(xyz, patches, midway_shares)))
         walls = self.hiding_share + 2 * showing_share(shares) > _HIDING_AND_SHOWING
         return _ROUNDS_OF_WALLS if walls else ROUNDS

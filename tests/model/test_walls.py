@@ -135,7 +135,7 @@ def test_noise_may_hide_walls_but_not_in_a_sheet(count: int) -> None:
 
 def test_strong_noise_has_few_rounds_of_spreading_on_one_surface_and_many_where_it_hides_walls() -> None:
     ball, walls = even_sphere(8000), even_plate(4000, 0.03)
-    for clean, noise_std, left, rounds in [(ball, 0.03, 0.006, 1), (ball, 0.015, 0.006, 2), (walls, 0.012, 0.006, 4)]:
+    for clean, noise_std, left, rounds in [(ball, 0.04, 0.006, 1), (ball, 0.03, 0.006, 2), (walls, 0.012, 0.006, 4)]:
         rough, passed = noisy(clean, noise_std), noisy(clean, left, seed=2)
         patches = cut_patches(rough, coverage=3.0, seed=0)
         in_unit_ball = noise_std if clean is ball else 0.03
