@@ -32,11 +32,11 @@ _LINES_AREA_RATIO = 1.3
 # Where so many points are far off their neighbours' surface, and what was read is so many times the noise of the
 # others, it is the noise of those few.
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
-# The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise is above what
-# it was trained on (HIGH_NOISE), in two of one surface. So points are spread in fewer rounds where that is and hardly
-# any patch may hide walls. They are in more where noise (its std in the unit ball) is strong, many patches may hide walls
-# and many show them after the first pass: the sum of the first share and twice the second is 0.84 and less of bodies
-# and lattices, 1.06 and more of thin walls.
+# The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise is more than
+# it was trained on (HIGH_NOISE), in two of one surface. So where that is and hardly any patch may hide walls, points
+# are spread in fewer rounds; in more where noise (its std in the unit ball) is strong, many patches may hide walls, and
+# many show them after the first pass: the first share and twice the second are 0.84 and less of bodies and lattices,
+# 1.06 and more of thin walls.
 _STRONG_NOISE, _HARDLY_HIDING_SHARE, _HIDING_AND_SHOWING = 0.025, 0.18, 0.95
 _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_WALLS = 1, 4
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
