@@ -24,7 +24,7 @@ from straightpcf.model.device import current, enough_memory
 from straightpcf.model.ops import knn
 from straightpcf.model.patches import PATCH_SIZE, Patches
 from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
-from straightpcf.model.spread import ROUNDS, TANGENT_NEIGHBOURS, spread_among
+from straightpcf.model.spread import TANGENT_NEIGHBOURS, spread_among
 from straightpcf.model.survey import survey_on
 from straightpcf.model.tiles import Tiling
 from straightpcf.points.errors import TooLarge
@@ -172,7 +172,7 @@ class OnDevice:
         return distances
 
     @torch.inference_mode()
-    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int = ROUNDS) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int) -> Floats:
         """Spread points (N, 3) along the surface, each among the patch that owned it; tiling: of the pass before.
 
         Raises TooLarge where it has no memory for them.

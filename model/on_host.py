@@ -15,7 +15,7 @@ import torch
 from straightpcf.model.agreement import Agreement
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Finish, Floats, Measure, Network, cut_out
-from straightpcf.model.spread import ROUNDS, spread
+from straightpcf.model.spread import spread
 from straightpcf.model.survey import survey
 from straightpcf.model.tiles import Tiling
 
@@ -82,7 +82,7 @@ class OnHost:
 
         return np.array(list(self.mapper(read, range(len(cut.seeds)))))
 
-    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int = ROUNDS) -> Floats:
+    def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int) -> Floats:
         """Spread tile by tile, the halo around."""
         moved = np.empty_like(positions)
         for rows, own in tiling.surroundings():

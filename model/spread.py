@@ -40,7 +40,7 @@ def spread(xyz: Floats, limit: float, *, rounds: int = ROUNDS, workers: int = 1,
 
 
 def spread_among(
-    xyz: torch.Tensor, around: torch.Tensor, limit: float, *, rounds: int = ROUNDS, mapper: Mapper = map
+    xyz: torch.Tensor, around: torch.Tensor, limit: float, *, rounds: int, mapper: Mapper = map
 ) -> torch.Tensor:
     """Do what `spread` does for points (N, 3) float64 on any device.
 

@@ -18,7 +18,7 @@ from straightpcf.model.filter import Filter
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import Capture, Graphs, OnDevice
 from straightpcf.model.outliers import isolated
-from straightpcf.model.spread import spread
+from straightpcf.model.spread import ROUNDS, spread
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.errors import TooLarge
 from straightpcf.points.options import DenoiseOptions
@@ -71,7 +71,7 @@ def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
 def test_neighbours_of_a_patch_spread_points_as_neighbours_of_the_cloud_do(network: StraightPCF) -> None:
     ball = sphere(8000, 0)
     tiling = Tiling(ball, split(ball, 10_000), coverage=3, seed=0)
-    moved = on_device(network).processor.spread(ball, tiling, 1.0)
+    moved = on_device(network).processor.spread(ball, tiling, 1.0, ROUNDS)
     apart = np.linalg.norm(moved - spread(ball, 1.0), axis=1)
     assert (apart < 1e-5).mean() > 0.99
     assert apart.mean() < 0.002 * np.linalg.norm(moved, axis=1).mean()
@@ -197,10 +197,10 @@ def test_out_of_memory_halves_the_batch_of_what_reads_and_spreads_too(
     monkeypatch.setattr(small, "_network", SimpleNamespace(distance=most(network.distance_module)))
     np.testing.assert_allclose(small.distances(ball, cut, scales), large.distances(ball, cut, scales), atol=1e-6)
     assert small.batch == 2
-    expected = large.spread(ball, tiling, 1.0)
+    expected = large.spread(ball, tiling, 1.0, ROUNDS)
     small.batch = 8
     monkeypatch.setattr(device_path, "knn", most(device_path.knn))
-    np.testing.assert_array_equal(small.spread(ball, tiling, 1.0), expected)
+    np.testing.assert_array_equal(small.spread(ball, tiling, 1.0, ROUNDS), expected)
     assert small.batch == 2
 
 
