@@ -91,7 +91,7 @@ def test_a_halo_that_would_be_the_whole_cloud_is_held_to_the_size_of_its_tile() 
 
 
 def test_no_seam_is_to_be_seen() -> None:
-    clean = torus(40_000)
+    clean = torus(20_000)
     xyz = noisy(clean, 0.01)
     options = DenoiseOptions(iterations=1)
     model = load_filter(device="cpu")
