@@ -30,7 +30,7 @@ def shipped() -> Filter:
 def tiny() -> Filter:
     """An untrained narrow network: enough for everything but quality, and fast."""
     torch.manual_seed(0)
-    return Filter(StraightPCF(width=128, distance_width=128), threads=2, coverage=2)
+    return Filter(StraightPCF(width=64, distance_width=64), threads=2, coverage=2)
 
 
 def test_noise_shrinks_on_a_torus(shipped: Filter) -> None:
@@ -137,7 +137,7 @@ def test_strength_scales_the_displacement(tiny: Filter) -> None:
 
 
 def test_the_noise_left_is_that_of_what_comes_out() -> None:
-    model, cloud = load_filter(threads=2), noisy(torus(3000), 0.02)
+    model, cloud = load_filter(threads=2), noisy(torus(2000), 0.02)
     none, some, most, full = (
         model.denoise(cloud, DenoiseOptions(iterations=2, strength=strength)) for strength in (0.0, 0.5, 0.99, 1.0)
     )
@@ -284,7 +284,7 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
 
 
 def test_a_part_with_more_noise_is_filtered_like_a_cloud_with_as_much(shipped: Filter) -> None:
-    clean = torus(12_000)
+    clean = torus(8000)
     loud = clean[:, 0] > 0.3
     noise = np.random.default_rng(1).standard_normal(clean.shape)
     left = [

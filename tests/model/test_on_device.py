@@ -36,7 +36,7 @@ def capture_by_calling(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
 @pytest.fixture(scope="module")
 def network() -> StraightPCF:
     torch.manual_seed(0)
-    return StraightPCF(width=64, distance_width=64)
+    return StraightPCF(width=32, distance_width=32)
 
 
 def on_device(
@@ -47,7 +47,7 @@ def on_device(
     return model
 
 
-@pytest.mark.parametrize("count", [500, 3000, 9000])  # one patch, fewer than a batch, a last batch that is not full
+@pytest.mark.parametrize("count", [500, 3000, 6000])  # one patch, fewer than a batch, a last batch that is not full
 def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) -> None:
     cloud = noisy(torus(count), 0.01)
     options = DenoiseOptions(iterations=3)
@@ -141,7 +141,7 @@ def test_where_capturing_fails_the_work_goes_on_without_graphs(network: Straight
     def refuse(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    cloud = noisy(torus(12_000), 0.01)
+    cloud = noisy(torus(6000), 0.01)
     with pytest.warns(UserWarning, match="not permitted"):
         result = on_device(network, capture=refuse).denoise(cloud, DenoiseOptions(iterations=1))
     expected = Filter(network, threads=1, coverage=3).denoise(cloud, DenoiseOptions(iterations=1))
