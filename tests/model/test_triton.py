@@ -20,7 +20,7 @@ from straightpcf.model.kernels import cuda
 
 device = "cuda" if torch.cuda.is_available() else "cpu"
 generator = torch.Generator().manual_seed(0)
-for points, channels, k, rows in ((200, 3, 32, 23), (200, 3, 16, 9), (130, 32, 32, 15), (333, 64, 32, 9),
+for points, channels, k, rows in ((200, 3, 32, 7), (200, 3, 16, 5), (130, 32, 32, 5), (333, 64, 32, 3),
                                   (20, 3, 32, 20), (2, 3, 32, 2), (34, 16, 32, 34)):
     x = torch.randn(2, points, channels, generator=generator).to(device)
     found, expected = cuda.knn(x, k, rows).long(), ops.knn_torch(x, k, rows)
@@ -38,7 +38,7 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     found, expected = cuda.edge_max(a[:, :22], b, index.int(), weight), ops.edge_max_torch(a[:, :22], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
 for prove in (cuda._prove, cuda._prove_gradient):
-    prove(torch.device(device), 1000 if device == "cuda" else 40)
+    prove(torch.device(device), 1000 if device == "cuda" else 34)
 cloud = torch.randn(9000, 3, generator=generator).to(device)
 for wanted, first in ((1, 0), (8, 1), (8, 8999)):
     assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
