@@ -22,13 +22,6 @@ from tests.conftest import RunningServer, run_server
 from tests.service.rest import curl
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
-    with run_server(tmp_path_factory.mktemp("jobs")) as server:
-        server.wait_until_ready()
-        yield server
-
-
 @pytest.fixture
 def http(server: RunningServer) -> Iterator[httpx2.Client]:
     with httpx2.Client(base_url=server.url, timeout=60) as client:
@@ -312,20 +305,19 @@ def test_a_key_sees_its_own_jobs_alone(tmp_path: Path) -> None:
 
 def test_a_key_that_asks_too_often_is_held_back_and_let_in_again(tmp_path: Path) -> None:
     # 120 a minute: the bucket holds 120 and gains one each half second, however often it is asked meanwhile.
-    with run_server(tmp_path, environment={"STRAIGHTPCF_RATE_PER_MINUTE": "120"}) as server:
-        server.wait_until_ready()
-        with httpx2.Client(base_url=server.url, timeout=60) as http:
-            answers = [http.get("/jobs")]
-            while answers[-1].status_code == 200 and len(answers) < 2000:
-                answers.append(http.get("/jobs"))
-            assert len(answers) > 120
-            problem = answers[-1].json()
-            assert (problem["status"], problem["code"], problem["retryable"]) == (429, "rate_limited", True)
-            assert answers[-1].headers["retry-after"] == "1"
-            assert http.get("/livez").status_code == 200
-            until = time.monotonic() + 10
-            while http.get("/jobs").status_code == 429:
-                assert time.monotonic() < until, "a client that keeps asking never gets in"
+    settings = {"STRAIGHTPCF_RATE_PER_MINUTE": "120"}
+    with run_server(tmp_path, environment=settings) as server, httpx2.Client(base_url=server.url, timeout=60) as http:
+        answers = [http.get("/jobs")]
+        while answers[-1].status_code == 200 and len(answers) < 2000:
+            answers.append(http.get("/jobs"))
+        assert len(answers) > 120
+        problem = answers[-1].json()
+        assert (problem["status"], problem["code"], problem["retryable"]) == (429, "rate_limited", True)
+        assert answers[-1].headers["retry-after"] == "1"
+        assert http.get("/livez").status_code == 200
+        until = time.monotonic() + 10
+        while http.get("/jobs").status_code == 429:
+            assert time.monotonic() < until, "a client that keeps asking never gets in"
 
 
 def test_pages_of_other_origins_may_call_only_where_the_operator_says_so(server: RunningServer, tmp_path: Path) -> None:
@@ -340,7 +332,6 @@ def test_pages_of_other_origins_may_call_only_where_the_operator_says_so(server:
 
     assert allowed(server.url, friend) is None
     with run_server(tmp_path, environment={"STRAIGHTPCF_CORS_ORIGINS": f"{friend}, https://third.example"}) as other:
-        other.wait_until_ready()
         assert allowed(other.url, friend) == friend
         assert allowed(other.url, stranger) is None
         asks = ["-X", "OPTIONS", "-H", "Access-Control-Request-Method: POST", f"{other.url}/denoise"]
