@@ -39,6 +39,7 @@ Compute = Callable[..., torch.Tensor]  # how many of a patch's points, and tenso
 _Key = tuple[int, int, int]  # patches, rows, tensors
 _BATCH = 32
 _ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
+_ASKED = 8  # so are those of patches of which only d is asked
 _MOST_GRAPHS = 16
 _IN_FLIGHT = 2  # batches of which the results have not been read
 _MOST_THREADS = 8  # of the CPU, beside the device: numpy's threads wait for each other the more the more they are
@@ -128,6 +129,7 @@ class OnDevice:
         self.device, self.batch, self._network = torch.device(device), batch, network
         self._begins = Graphs(self._begin, capture)
         self._moves = Graphs(self._move, capture)
+        self._asked = Graphs(self._say, capture)
         self._pool = ThreadPoolExecutor(min(threads, _MOST_THREADS))
 
     def displacements(
@@ -167,9 +169,16 @@ class OnDevice:
         """Return what the DistanceModule says of each patch: (M,). Raises TooLarge as `displacements` does."""
         points, sent = self._sent(positions, cut, scales, {})
         with current(self.device):
-            found = list(self._batched(cut, lambda batch: self._network.distance(sent.cut_out(points, batch))))
+            found = list(self._batched(cut, partial(self._ask, points, sent)))
         distances: Floats = torch.cat(found).flatten().double().cpu().numpy()
         return distances
+
+    def _ask(self, points: torch.Tensor, sent: _DeviceCut, some: slice) -> torch.Tensor:
+        """Return what the DistanceModule says of some patches: (n, 1)."""
+        chosen = range(len(sent.seeds))[some]
+        full = min(self.batch, _ASKED * math.ceil(len(chosen) / _ASKED))
+        x = sent.cut_out(points, self._filled(chosen, full))
+        return self._asked(x.shape[1], x)[: len(chosen)].clone()
 
     @torch.inference_mode()
     def spread(self, positions: Floats, tiling: Tiling, limit: float, rounds: int) -> Floats:
@@ -228,6 +237,7 @@ class OnDevice:
         self.batch //= 2
         self._begins.clear()
         self._moves.clear()
+        self._asked.clear()
         torch.cuda.empty_cache()
 
     def _finished(self, batch: range, result: _Result, cut: Patches, finish: Finish[_T]) -> Iterator[_T]:
@@ -239,11 +249,14 @@ class OnDevice:
     def _hear(self, points: torch.Tensor, sent: _DeviceCut, heard: _Heard, some: slice) -> int:
         """Have the first evaluation of some patches made, and return how many they are."""
         chosen = range(len(sent.seeds))[some]
-        batch = self._filled(sent, chosen)
+        batch = self._filled(chosen, self._full(sent, chosen))
         x = sent.cut_out(points, batch)
         said = self._begins(x.shape[1], x, *sent.known_of(chosen, batch))[: len(chosen)]
         heard.add(slice(chosen.start, chosen.stop), x[: len(chosen)], said)
         return len(chosen)
+
+    def _say(self, rows: int, x: torch.Tensor) -> torch.Tensor:
+        return self._network.distance(x)
 
     def _begin(self, rows: int, x: torch.Tensor, *known: torch.Tensor) -> torch.Tensor:
         """Return the first evaluation's velocities and, as one more point, three times d: (B, P + 1, 3)."""
@@ -259,14 +272,16 @@ class OnDevice:
     def _launch(
         self, points: torch.Tensor, cut: Patches, sent: _DeviceCut, chosen: range, heard: _Heard | None
     ) -> torch.Tensor:
-        batch = self._filled(sent, chosen)
+        batch = self._filled(chosen, self._full(sent, chosen))
         known = sent.known_of(chosen, batch) if heard is None else heard.of_patches(batch)
         rows = max(1, int(cut.owned[chosen.start : chosen.stop].max()))
         return self._moves(rows, sent.cut_out(points, batch), sent.owned[batch], *known)
 
-    def _filled(self, sent: _DeviceCut, chosen: range) -> torch.Tensor:
-        # A last batch that is not full is filled up with its last patch: one shape more would be one graph more.
-        full = self.batch if len(sent.seeds) > self.batch else len(chosen)
+    def _full(self, sent: _DeviceCut, chosen: range) -> int:
+        return self.batch if len(sent.seeds) > self.batch else len(chosen)
+
+    def _filled(self, chosen: range, full: int) -> torch.Tensor:
+        # A batch that is not full is filled up with its last patch: one shape more would be one graph more.
         return torch.arange(chosen.start, chosen.start + full, device=self.device).clamp(max=chosen.stop - 1)
 
 

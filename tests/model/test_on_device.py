@@ -193,7 +193,8 @@ def test_out_of_memory_halves_the_batch_of_what_reads_and_spreads_too(
     tiling = Tiling(ball, split(ball, 10_000), coverage=3, seed=0)
     cut = next(tiling.cuts())
     scales = np.ones(len(cut.seeds))
-    large, small = (OnDevice(Filter(network, threads=1), "cpu", batch=8) for _ in range(2))
+    of = Filter(network, threads=1)
+    large, small = (OnDevice(of, "cpu", batch=8, capture=capture_by_calling) for _ in range(2))
     monkeypatch.setattr(small, "_network", SimpleNamespace(distance=most(network.distance_module)))
     np.testing.assert_allclose(small.distances(ball, cut, scales), large.distances(ball, cut, scales), atol=1e-6)
     assert small.batch == 2
