@@ -104,8 +104,8 @@ def test_walls_that_the_first_pass_uncovers_are_not_joined_by_the_next() -> None
     assert not thin_walls(rough)
     model = load_filter(threads=2)
     once, twice = (model.denoise(rough, DenoiseOptions(iterations=passes)) for passes in (1, 2))
-    off = [np.sqrt(np.square(np.abs(result.xyz[:, 2]) - 0.02).mean()) for result in (once, twice)]
-    assert off[1] < 1.1 * off[0]
+    off = np.sqrt(np.square(np.abs(twice.xyz[:, 2]) - 0.02).mean())
+    assert off < 0.7 * 0.02  # 0.65; joined, they would be 0.02 off, and are 0.0148 where nothing holds them back
     assert not any("walls" in warning for warning in once.warnings)
     assert any("walls closer together" in warning for warning in twice.warnings)
 
