@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -229,19 +230,19 @@ class PatchSource:
         self.by_name: dict[tuple[Path, str], Surface] = {}  # of shapes that were read, in their own coordinates
         self._own: list[Surface] = []
         unknown = [None] * len(shapes)
-        beside = zip(shapes, normals or unknown, surfaces or unknown, eyes or unknown, strict=True)
-        for shape, given, surface, eye in beside:
-            own = Surface.of(shape, given, surface)
-            self._own.append(own)
-            for cloud in shape:
-                wide = cloud.astype(np.float64)
-                frame = CloudFrame.of(wide)
-                self.clouds.append(frame.enter(wide))
-                self.surfaces.append(Surface(frame.enter(own.xyz), own.normals))
-                self.eyes.append(None if eye is None else frame.enter(eye.astype(np.float64)))
-        self.passed: PatchMaker | None = None  # draws patches of clouds after passes
-        self._trees = [cKDTree(cloud) for cloud in self.clouds]
-        self.zooms = np.stack([self._zooms(cloud, tree) for cloud, tree in zip(self.clouds, self._trees, strict=True)])
+        # Trees, lookups and eigenvectors hold no lock.
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            self._own.extend(pool.map(Surface.of, shapes, normals or unknown, surfaces or unknown))
+            for shape, own, eye in zip(shapes, self._own, eyes or unknown, strict=True):
+                for cloud in shape:
+                    wide = cloud.astype(np.float64)
+                    frame = CloudFrame.of(wide)
+                    self.clouds.append(frame.enter(wide))
+                    self.surfaces.append(Surface(frame.enter(own.xyz), own.normals))
+                    self.eyes.append(None if eye is None else frame.enter(eye.astype(np.float64)))
+            self.passed: PatchMaker | None = None  # draws patches of clouds after passes
+            self._trees = list(pool.map(cKDTree, self.clouds))
+            self.zooms = np.stack(list(pool.map(self._zooms, self.clouds, self._trees)))
 
     @staticmethod
     def _zooms(cloud: npt.NDArray[np.float64], tree: cKDTree) -> npt.NDArray[np.float64]:
