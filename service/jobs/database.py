@@ -144,7 +144,7 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
         raise InvalidOptions(f"{path} is of schema {version}; this straightpcf is older and knows {SCHEMA_VERSION}")
     db.executescript(files(__package__).joinpath("schema.sql").read_text())
     # Asked before: a full disk has no room for what is there already.
-    if version != SCHEMA_VERSION or not {"deaths", "spool"} <= _columns(db):
+    if version != SCHEMA_VERSION or not {"deaths", "server_deaths", "spool"} <= _columns(db):
         with transaction(db):  # of several servers that start at once, one
             _upgrade(db)
     db.execute(_KEPT)
@@ -156,8 +156,8 @@ def _columns(db: sqlite3.Connection) -> set[str]:
 
 def _upgrade(db: sqlite3.Connection) -> None:
     columns = _columns(db)
-    if "deaths" not in columns:  # before versions were counted
-        db.execute("ALTER TABLE jobs ADD COLUMN deaths INTEGER NOT NULL DEFAULT 0")
+    for deaths in {"deaths", "server_deaths"} - columns:  # the first of before versions were counted
+        db.execute(f"ALTER TABLE jobs ADD COLUMN {deaths} INTEGER NOT NULL DEFAULT 0")
     if "spool" not in columns:  # likewise
         db.execute("ALTER TABLE jobs ADD COLUMN spool INTEGER NOT NULL DEFAULT 0")
         db.execute("UPDATE jobs SET spool = bytes + IFNULL(json_extract(result, '$.bytes'), 0)")

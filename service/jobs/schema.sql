@@ -14,6 +14,7 @@ CREATE TABLE IF NOT EXISTS jobs (
   progress REAL NOT NULL DEFAULT 0,
   attempts INTEGER NOT NULL DEFAULT 0,
   deaths INTEGER NOT NULL DEFAULT 0,  -- of workers that had it, not of servers: a cloud that kills three is given up
+  server_deaths INTEGER NOT NULL DEFAULT 0,
   fence INTEGER NOT NULL DEFAULT 0,
   server TEXT,                        -- who works on it
   lease_until REAL,                   -- and until when that is believed: seconds since the machine began

@@ -40,10 +40,9 @@ from straightpcf.service.jobs.record import (
 from straightpcf.service.jobs.rows import event_of, record_of
 from straightpcf.service.jobs.turns import count_turn, next_row, positions
 
-__all__ = ["MAX_ATTEMPTS", "JobStore"]
+__all__ = ["MAX_SERVER_DEATHS", "JobStore"]
 
-# Of a job whose server dies; more than the runner's MAX_DEATHS of workers, for servers die of much else.
-MAX_ATTEMPTS = 6
+MAX_SERVER_DEATHS = 6  # more than the runner's MAX_DEATHS of workers, for servers die of much else
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
 _RELEASED = "state = 'queued', server = NULL, lease_until = NULL, progress = 0"
@@ -254,21 +253,22 @@ class JobStore:
     def recover(self, dead_servers: Collection[str] = (), *, expires_in: float) -> list[str]:
         """Release the jobs whose lease ran out, or whose server is known to be dead; return their ids.
 
-        One that had MAX_ATTEMPTS and whose server died fails: where a cloud asks for more memory than a container may
+        One under which MAX_SERVER_DEATHS servers died fails: where a cloud asks for more memory than a container may
         have, and all of that is killed for it (Kubernetes), it would be begun for ever, and no other job.
         """
         with self._transaction():
             rows = self._db.execute(
-                "SELECT id, server, attempts, cancel_requested FROM jobs"
+                "SELECT id, server, server_deaths, cancel_requested FROM jobs"
                 f" WHERE state IN {_WORKING} AND (lease_until < ? OR server IN ({', '.join('?' * len(dead_servers))}))",
                 (time.monotonic(), *dead_servers),
             ).fetchall()
             for row in rows:
-                died = row["server"] in dead_servers
-                if died and row["attempts"] >= MAX_ATTEMPTS and not row["cancel_requested"]:
-                    self._end(row["id"], "failed", error=_given_up(row["attempts"]), expires_in=expires_in)
+                deaths = row["server_deaths"] + (row["server"] in dead_servers)
+                if deaths >= MAX_SERVER_DEATHS and not row["cancel_requested"]:
+                    self._end(row["id"], "failed", error=_given_up(deaths), expires_in=expires_in)
                     continue
-                self._db.execute(f"UPDATE jobs SET {_RELEASED}, fence = fence + 1 WHERE id = ?", (row["id"],))
+                set_ = f"{_RELEASED}, fence = fence + 1, server_deaths = ?"
+                self._db.execute(f"UPDATE jobs SET {set_} WHERE id = ?", (deaths, row["id"]))
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
 
@@ -367,8 +367,8 @@ class JobStore:
         return record_of(row, queued.get(row["seq"]))
 
 
-def _given_up(attempts: int) -> dict[str, str]:
-    said = f"its server died while it worked on it, in attempt {attempts}; the cloud was then given up"
+def _given_up(deaths: int) -> dict[str, str]:
+    said = f"its server died while it worked on it, {deaths} times; the cloud was then given up"
     return {"code": InternalError.code, "detail": said}
 
 

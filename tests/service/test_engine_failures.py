@@ -27,7 +27,7 @@ from straightpcf.service.engine import Engine
 from straightpcf.service.jobs import runner
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import Claim
-from straightpcf.service.jobs.store import MAX_ATTEMPTS, Hold, JobStore
+from straightpcf.service.jobs.store import MAX_SERVER_DEATHS, Hold, JobStore
 from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, running, submit, until
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -232,7 +232,7 @@ def test_a_job_whose_server_dies_each_time_is_given_up_and_the_next_ones_are_don
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         fatal, other = [(await submit(engine, content))[0] for content in (b"0", b"1")]
-        for attempt in range(1, MAX_ATTEMPTS + 1):
+        for attempt in range(1, MAX_SERVER_DEATHS + 1):
             assert (await engine.get(fatal.id)).state == "queued"
             claim = await engine._call(JobStore.claim, "the dead", 15.0)
             assert (claim.record.id, claim.record.attempts) == (fatal.id, attempt)
@@ -240,7 +240,7 @@ def test_a_job_whose_server_dies_each_time_is_given_up_and_the_next_ones_are_don
         record = await engine.get(fatal.id)
         assert record.state == "failed"
         assert isinstance(record.error, InternalError)
-        assert "attempt 6; the cloud was then given up" in record.error.message
+        assert "6 times; the cloud was then given up" in record.error.message
         assert (await kinds(engine, fatal.id))[-1] == "completed"
         backend.go.set()
         backend.finish.set()
@@ -249,12 +249,16 @@ def test_a_job_whose_server_dies_each_time_is_given_up_and_the_next_ones_are_don
     play(tmp_path, scenario)
 
 
-def test_a_lease_that_runs_out_gives_no_job_up(tmp_path: Path) -> None:
+def test_a_lease_that_runs_out_and_a_server_that_stops_in_order_give_no_job_up(tmp_path: Path) -> None:
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         record, _ = await submit(engine)
-        for _ in range(MAX_ATTEMPTS + 1):
+        for _ in range(MAX_SERVER_DEATHS + 1):
             await engine._call(JobStore.claim, engine._folders.server, -1.0)  # of a server that lives
             await engine._sweeper.sweep()
+            claim = await engine._call(JobStore.claim, "restarted", 15.0)
+            await engine._call(JobStore.release, record.id, claim.fence, "the server stops", expires_in=60)
+        await engine._call(JobStore.claim, "the dead", 15.0)
+        await engine._sweeper.sweep()
         assert (await engine.get(record.id)).state == "queued"
 
     play(tmp_path, scenario)
@@ -344,7 +348,7 @@ def test_what_is_over_its_time_makes_the_room_that_marking_it_takes(
     play(tmp_path, scenario, result_ttl_seconds=1e-6)
 
 
-def test_a_store_from_before_patches_were_counted_is_taken_over(tmp_path: Path) -> None:
+def test_a_store_from_before_patches_and_deaths_were_counted_is_taken_over(tmp_path: Path) -> None:
     async def leave(engine: Engine, backend: ObedientBackend) -> None:
         backend.go.set()
         backend.finish.set()
@@ -356,6 +360,7 @@ def test_a_store_from_before_patches_were_counted_is_taken_over(tmp_path: Path) 
     play(tmp_path, leave)
     with closing(sqlite3.connect(tmp_path / "jobs.sqlite3")) as db:
         db.executescript("DROP INDEX jobs_kept; ALTER TABLE jobs DROP COLUMN spool")
+        db.executescript("ALTER TABLE jobs DROP COLUMN deaths; ALTER TABLE jobs DROP COLUMN server_deaths")
     play(tmp_path, find)
 
 
