@@ -13,7 +13,9 @@ from straightpcf.points.errors import InvalidCloud
 
 __all__ = ["NORMALS", "PointCloud", "as_positions"]
 
-NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))  # what files call them
+# What files call them: PLY, PCD, PDAL.
+NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("NormalX", "NormalY", "NormalZ"))
+_NORMAL_ARRAYS = ("normals", "normal")  # (N, 3), in NumPy's archives
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +69,16 @@ class PointCloud:
         if self.normals is not None:
             columns = zip(self.normal_names, self.normals.T, strict=True)
             new |= {name: values.astype(self.attributes[name].dtype) for name, values in columns}
-        free = not {*normals} & {*new}
-        called = dict(zip(self.normal_names, normals, strict=False)) if free else {}
-        return {called.get(name, name): values for name, values in new.items()}
+        if {*normals} & {*new}:
+            return new
+        if names := self.normal_names:
+            called = dict(zip(names, normals, strict=True))
+            return {called.get(name, name): values for name, values in new.items()}
+        for name in _NORMAL_ARRAYS:
+            if name in new and new[name].shape == (len(self), 3) and new[name].dtype.kind == "f":
+                together = new.pop(name)
+                return {**new, **dict(zip(normals, together.T, strict=True))}
+        return new
 
     def with_normals(self, normals: npt.NDArray[np.float64]) -> PointCloud:
         """Return the same cloud with other normals, (N, 3) float64; it must have some."""

@@ -15,6 +15,8 @@ RGB = ("red", "green", "blue")
 PACKED = ("rgb", "rgba")  # PCL's: the bytes of a 32 bit number, 0xAARRGGBB, often called a float
 _NO_COLOUR = np.uint32(0x7FC00000)  # NaN, which PCL has for points that are not there
 _TRIPLES = (RGB, ("r", "g", "b"))
+_ARRAYS = ("colors", "color", "colours", "colour")  # (N, 3), as Open3D has it and NumPy's archives hold it
+_SAME = 1e-3  # of a step of 1/255: what float32 rounds a share to
 _Attributes = Mapping[str, npt.NDArray[Any]]
 
 
@@ -68,8 +70,9 @@ def packed(attributes: _Attributes) -> dict[str, npt.NDArray[Any]]:
 
 
 def unpacked(attributes: _Attributes) -> dict[str, npt.NDArray[Any]]:
-    """Return attributes with a packed colour as red, green and blue; another one stays as it is."""
-    return in_8_bits(attributes) if any(name in attributes for name in PACKED) else dict(attributes)
+    """Return attributes with a packed colour, or one array, as red, green and blue; another one stays as it is."""
+    together = {*PACKED} & {*attributes} or {*_ARRAYS} & {name.lower() for name in attributes}
+    return in_8_bits(attributes) if together else dict(attributes)
 
 
 def _colour(attributes: _Attributes) -> _Colour | None:
@@ -80,6 +83,10 @@ def _colour(attributes: _Attributes) -> _Colour | None:
         rgb = _whole([attributes[name] for name in names]) if len(names) == 3 else None
         others = {name: values for name, values in attributes.items() if name not in names}
         if rgb is not None and not {*RGB} & {*others}:
+            return _Colour(rgb, others)
+    for name in (called[name] for name in _ARRAYS if name in called):
+        others = {other: values for other, values in attributes.items() if other != name}
+        if (rgb := _of_array(attributes[name])) is not None and not {*RGB} & {*others}:
             return _Colour(rgb, others)
     for name in PACKED:
         values = attributes.get(name)
@@ -103,6 +110,16 @@ def _whole(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any] | None:
     if numbers.max(initial=0) == 1 and any(kind.kind == "f" for kind in kinds):
         return None  # floats of 0 and 1 may as well be the whole range
     return numbers.astype(np.uint8 if (numbers < 256).all() else np.uint16)
+
+
+def _of_array(values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
+    """Return (N, 3) colours as uint8 or uint16; floats from 0 to 1 are shares of 255, where all are whole ones."""
+    if values.ndim != 2 or values.shape[1] != 3:
+        return None
+    if values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all():
+        shares = 255 * values.astype(np.float64)
+        return np.rint(shares).astype(np.uint8) if (np.abs(shares - np.rint(shares)) < _SAME).all() else None
+    return _whole(list(values.T))
 
 
 def _of_packed(values: npt.NDArray[Any], others: dict[str, npt.NDArray[Any]]) -> _Colour:

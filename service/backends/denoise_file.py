@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats import FORMATS, format_named, read_cloud, write_cloud
 from straightpcf.points.formats.base import Format
@@ -142,7 +142,8 @@ class _Preview:
 
 def _check_normals(cloud: PointCloud, target: Format) -> None:
     if not cloud.normal_names:
-        raise UnsupportedCloud("normals=recompute wants a file with normals (nx ny nz, or normal_x normal_y normal_z)")
+        known = ", or ".join(" ".join(names) for names in NORMALS)
+        raise UnsupportedCloud(f"normals=recompute wants a file with normals ({known})")
     if not target.writes_normals:
         able = ", ".join(format.name for format in FORMATS if format.writes_normals)
         raise UnsupportedCloud(f"normals=recompute is for {able}; the result would be {target.name}")

@@ -34,6 +34,9 @@ SAID = {
     "PCL's rgba": {"rgba": WORDS | np.uint32(0xFF000000)},
     "PCL's rgb that are NaN": {"rgb": (WORDS | np.uint32(0xFF000000)).view("<f4")},
     "big-endian rgb": {"rgb": WORDS.view("<f4").astype(">f4")},
+    "an array of bytes": {"Colors": BYTES},
+    "an array of Open3D's shares": {"colors": BYTES / 255},
+    "an array of torch's shares": {"color": (BYTES / 255).astype(np.float32)},
 }
 
 
@@ -104,6 +107,7 @@ def test_a_pts_file_has_its_columns_and_no_names(tmp_path: Path) -> None:
 
 def test_packed_colours_become_columns_of_text_and_others_stay(tmp_path: Path) -> None:
     assert converted(SAID["PCL's rgba"], "csv", tmp_path).read_bytes().startswith(b"x,y,z,red,green,blue\n")
+    assert converted(SAID["an array of bytes"], "csv", tmp_path).read_bytes().startswith(b"x,y,z,red,green,blue\n")
     assert converted(SAID["text"], "csv", tmp_path).read_bytes().startswith(b"x,y,z,R,G,B\n")
 
 
@@ -123,6 +127,10 @@ def test_alpha_is_kept_where_it_says_something() -> None:
         {"rgb": WORDS.astype(np.float64)},
         {"rgb": WORDS.view("<f4"), "red": BYTES[:, 0]},
         {"rgb": BYTES},
+        {"colors": np.random.default_rng(0).random((N, 3))},
+        {"colors": BYTES - 0.5},
+        {"colors": BYTES[:, :2]},
+        {"colors": BYTES, "red": BYTES[:, 0]},
     ],
 )
 def test_what_may_be_something_else_stays_as_it_is(said: dict[str, npt.NDArray[Any]]) -> None:

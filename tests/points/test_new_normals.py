@@ -108,6 +108,17 @@ def test_a_new_file_calls_normals_as_its_readers_do(
     assert [*read_cloud(out)[0].attributes] == [*NORMALS[0], *NORMALS[1]]
 
 
+def test_an_array_of_normals_becomes_columns(tmp_path: Path) -> None:
+    np.savez(source := tmp_path / "cloud.npz", points=XYZ, normals=OLD, colors=np.full((N, 3), 255, np.uint8))
+    cloud, _ = read_cloud(source)
+    for target in ("ply", "pcd"):
+        write_cloud(cloud, out := tmp_path / f"new.{target}", format_named(target))
+        np.testing.assert_array_equal(read_cloud(out)[0].old_normals(), OLD)
+    both = PointCloud(cloud.xyz, {"normals": OLD, "nx": OLD[:, 0]})
+    write_cloud(both, out := tmp_path / "new.ply", format_named("ply"))
+    assert [*read_cloud(out)[0].attributes] == ["normals_0", "normals_1", "normals_2", "nx"]
+
+
 def test_a_cloud_without_normals_takes_none() -> None:
     cloud = PointCloud(XYZ.astype(np.float64), {"nx": OLD[:, 0], "ny": OLD[:, 1]})
     assert cloud.normal_names == ()
