@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.distinct import box_of
+
 __all__ = [
     "HIGH_NOISE",
     "LARGEST_RADIUS",
@@ -54,7 +56,7 @@ class CloudFrame:
     @classmethod
     def of(cls, xyz: npt.NDArray[np.float64]) -> CloudFrame:
         """Measure finite points (N, 3); the radius is 0 where they all coincide."""
-        low, high = xyz.min(axis=0), xyz.max(axis=0)
+        low, high = box_of(xyz)
         centre = low / 2 + high / 2  # halves first: the sum may overflow
         extent = float(max((high - centre).max(), (centre - low).max()))
         if extent == 0.0:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.distinct import half_reach
+from straightpcf.model.distinct import box_of, half_reach
 from straightpcf.model.normalize import CloudFrame, is_scene
 from straightpcf.model.patches import PATCH_SIZE
 
@@ -38,7 +38,7 @@ def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     if len(xyz) == 0:
         return none
     middle, reach = half_reach(xyz)
-    ends = np.stack([xyz.min(axis=0), xyz.max(axis=0)]) / 2
+    ends = np.stack(box_of(xyz)) / 2
     if reach == 0 or np.abs(ends - middle).max() / FAR_OUT <= reach:
         return none
     far: npt.NDArray[np.bool_] = np.abs(xyz / 2 - middle).max(axis=1) / FAR_OUT > reach

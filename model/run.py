@@ -121,6 +121,7 @@ class Run:
             return np.zeros(len(self.rows), dtype=bool)
         positions = self.frame.enter(self.points.xyz)
         self._first = self._tiling(positions)
+        self._first.expect_parts()
         nearest = self.filter.processor.nearest_others(positions, self._first, NEIGHBOURS)
         apart = isolated(positions, workers=self.filter.threads, nearest=nearest)
         return apart[self.points.inverse]

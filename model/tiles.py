@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from straightpcf.model.device_patches import cut_patches_on
+from straightpcf.model.distinct import box_of
 from straightpcf.model.patches import PATCH_SIZE, Patches, cut_patches, patches_around
 
 __all__ = ["Tiling", "split"]
@@ -33,7 +35,8 @@ def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np
         if len(rows) <= tile_points:
             tiles.append(np.sort(rows))
             continue
-        axis = int(np.argmax(np.ptp(xyz[rows], axis=0)))
+        low, high = box_of(xyz[rows])
+        axis = int(np.argmax(high - low))
         middle = len(rows) // 2
         order = np.argpartition(xyz[rows, axis], middle)
         left += [rows[order[middle:]], rows[order[:middle]]]
@@ -64,6 +67,7 @@ class Tiling:
         self._cut: Callable[[npt.NDArray[np.float64]], Patches] = partial(cut, coverage=coverage, seed=seed)
         self._margins: list[float] = []
         self._kept: list[Patches] | None = None if on_host else []
+        self._dealt: Future[list[npt.NDArray[np.int64]]] | None = None
 
     @cached_property
     def whole(self) -> Patches | None:
@@ -79,9 +83,19 @@ class Tiling:
         """
         return [np.sort(np.concatenate([rows[part::parts] for rows in self._by_leaves])) for part in range(parts)]
 
+    def expect_parts(self) -> None:
+        """Begin what `subsamples` needs, on a thread, where a device cuts: its host has nothing else to do."""
+        if self._kept is not None and self._dealt is None:
+            pool = ThreadPoolExecutor(1)
+            self._dealt = pool.submit(self._dealt_out)
+            pool.shutdown(wait=False)
+
     @cached_property
     def _by_leaves(self) -> list[npt.NDArray[np.int64]]:
         """The tiles' rows in that order: of one tree, however often a pass is parted."""
+        return self._dealt_out() if self._dealt is None else self._dealt.result()
+
+    def _dealt_out(self) -> list[npt.NDArray[np.int64]]:
         return [rows[cKDTree(self._xyz[rows]).indices] for rows in self.tiles]
 
     def probes(self, count: int = _PROBES) -> tuple[Patches, range]:
@@ -125,7 +139,7 @@ class Tiling:
 
 def _halo(xyz: npt.NDArray[np.float64], core: npt.NDArray[np.int64], margin: float) -> npt.NDArray[np.int64]:
     """Return the rows outside `core` in its box widened by `margin`; the nearest, where they outnumber the core."""
-    low, high = xyz[core].min(axis=0), xyz[core].max(axis=0)
+    low, high = box_of(xyz[core])
     near = np.ones(len(xyz), dtype=bool)
     for axis in range(3):
         column = xyz[:, axis]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -54,6 +56,23 @@ def test_a_pass_that_is_parted_again_builds_no_second_tree(monkeypatch: pytest.M
     assert len(built) == len(tiles)
 
 
+@pytest.mark.parametrize(("device", "is_ahead"), [("cpu", False), ("cpu:0", True)])  # "cpu" is the host's own way
+def test_beside_a_device_the_tree_is_built_ahead_and_once(
+    device: str, is_ahead: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    xyz = torus(3000)
+    expected = tiling_of(xyz, tiles := split(xyz, 3000)).subsamples(3)
+    built: list[threading.Thread] = []
+    monkeypatch.setattr(
+        model_tiles, "cKDTree", lambda points: built.append(threading.current_thread()) or cKDTree(points)
+    )
+    tiling = Tiling(xyz, tiles, coverage=3, seed=0, device=device)
+    for _ in range(2):
+        tiling.expect_parts()
+    assert all(map(np.array_equal, tiling.subsamples(3), expected))
+    assert [thread is not threading.main_thread() for thread in built] == [is_ahead]
+
+
 def test_parts_are_as_evenly_spread_as_the_whole() -> None:
     xyz = torus(12_000)
     for part in tiling_of(xyz, split(xyz, 4000)).subsamples(3):
@@ -74,7 +93,7 @@ def test_every_point_is_owned_once_by_patches_of_its_own_tiles_cut() -> None:
 
 def test_a_devices_cuts_are_made_once_and_read_again() -> None:
     xyz = noisy(torus(12_000), 0.01)
-    tiling = Tiling(xyz, split(xyz, 6_000), coverage=3, seed=0, device="cpu:0")  # "cpu" is the host's own way
+    tiling = Tiling(xyz, split(xyz, 6_000), coverage=3, seed=0, device="cpu:0")
     tiling.probes(48)
     once, again = list(tiling.cuts()), list(tiling.cuts())
     assert len(once) == 2
