@@ -1,8 +1,8 @@
 """How much of a step the network asks for is made: what is more than the noise is not.
 
-The points of a scene go no farther than its noise reaches, not off the line that they lie in, and not along a surface,
-nor do those of an object that lie on it by chance. Those of an object with little noise go less far (`low_noise`), and
-where walls would be joined none goes (`walls`).
+The points of a scene go no farther than its noise reaches, nowhere where they lie in no surface, not off the line that
+they lie in, and not along a surface, nor do those of an object that lie on it by chance. Those of an object with little
+noise go less far (`low_noise`), and where walls would be joined none goes (`walls`).
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from straightpcf.model.low_noise import wiener_weighted
-from straightpcf.model.neighbourhoods import neighbourhoods
+from straightpcf.model.neighbourhoods import Neighbourhoods, neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
 
 __all__ = [
     "along_heights",
     "held_to_lines",
+    "held_where_scattered",
     "limited_to_noise",
     "restrained_step",
     "trusted_noise_stds",
@@ -38,9 +39,13 @@ _HELD_BACK_SHARE = 0.5  # of a step; where less is left between walls, that is s
 _PLANE_NEIGHBOURS = 24
 _PLANE_RATIO, _VOLUME_RATIO, _LINE_RATIO = 0.15, 0.3, 0.1
 _STEEP = 0.5  # of a raster: where the normal has less along the heights, these are not read off the step across
-# So many neighbours lie in a line where the greater of their stds across it is a tenth of that along it, and in none
-# from a fifth on. A mean and the line's direction take three of them (degrees of freedom).
-_LINE_NEIGHBOURS, _IN_LINE_RATIO, _OFF_LINE_RATIO, _LINE_FREEDOM = 8, 0.1, 0.2, 3
+_FEW_NEIGHBOURS = 8
+# So many lie in a line where the greater of their stds across it is a tenth of that along it, and in none from a fifth
+# on. A mean and the line's direction take three of them (degrees of freedom).
+_IN_LINE_RATIO, _OFF_LINE_RATIO, _LINE_FREEDOM = 0.1, 0.2, 3
+# Their std across their plane, in those of the noise: up to the first they may be of a surface (of a plane's points it
+# is 0.8), from the last on they are of none.
+_SURFACE_STDS, _SCATTERED_STDS = 2.0, 3.0
 
 
 def restrained_step(
@@ -59,7 +64,9 @@ def restrained_step(
     if len(step) == 0:
         return step, False
     if trusted_noise is not None:
-        step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch)
+        near = neighbourhoods(patch[: len(step)], patch, _FEW_NEIGHBOURS)
+        step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch, near)
+        step = held_where_scattered(step, near, trusted_noise)
     share = 1.0
     if sampling.thin_walls:
         share = share_between_walls(step, patch, uncovered=sampling.uncovered, by_chance=sampling.irregular)
@@ -100,15 +107,15 @@ def limited_to_noise(
     return out
 
 
-def held_to_lines(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def held_to_lines(
+    step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64], near: Neighbourhoods
+) -> npt.NDArray[np.float64]:
     """Return a step (n, 3), less of what goes off the line that points lie in, where they do.
 
-    patch: (P, 3) points, of which the first n >= 1 make the step. A wire, a railing or the edge of a ledge is a line
-    of points near a wall, to which the network draws them. How they scatter about their line is their noise n;
-    of moves m off it a share of n^2 / m^2 leaves least error (Wiener's weight).
+    patch: (P, 3) points, of which the first n >= 1 make the step; near: theirs, of a few points. A wire, a railing or
+    the edge of a ledge is a line of points near a wall, to which the network draws them. How they scatter about their
+    line is their noise n; of moves m off it a share of n^2 / m^2 leaves least error (Wiener's weight).
     """
-    points = patch[: len(step)]
-    near = neighbourhoods(points, patch, _LINE_NEIGHBOURS)
     least, less, most = np.maximum(near.variances, 0.0).T
     ratio = np.sqrt(less / np.maximum(most, 1e-300))
     in_line = np.clip((_OFF_LINE_RATIO - ratio) / (_OFF_LINE_RATIO - _IN_LINE_RATIO), 0, 1) * (most > 0)
@@ -117,10 +124,25 @@ def held_to_lines(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64])
     direction = near.axes[:, :, 2]
     off = step - (step * direction).sum(axis=1, keepdims=True) * direction
     noise = (least + less) / max(1, near.local.shape[1] - _LINE_FREEDOM)
-    _, beside = cKDTree(points).query(points, k=np.arange(1, min(_LINE_NEIGHBOURS, len(points)) + 1))
+    points = patch[: len(step)]
+    _, beside = cKDTree(points).query(points, k=np.arange(1, min(_FEW_NEIGHBOURS, len(points)) + 1))
     moves = np.square(off).sum(axis=1)[beside].mean(axis=1)
     kept = in_line * (1 - np.minimum(1.0, noise / np.maximum(moves, 1e-300)))
     out: npt.NDArray[np.float64] = step - off * kept[:, None]
+    return out
+
+
+def held_where_scattered(
+    step: npt.NDArray[np.float64], near: Neighbourhoods, noise_std: float
+) -> npt.NDArray[np.float64]:
+    """Return a step (n, 3), less of it the farther points scatter from a plane than noise lets a surface's.
+
+    near: those of the n points, of a few. Leaves, a pole or a railing that is seen from above, what is met once behind
+    an edge: there is no surface to go to, and the network goes to the nearest that there is.
+    """
+    thickness = np.sqrt(np.maximum(near.variances[:, 0], 0.0) / near.local.shape[1]) / max(noise_std, 1e-300)
+    share = np.clip((_SCATTERED_STDS - thickness) / (_SCATTERED_STDS - _SURFACE_STDS), 0.0, 1.0)
+    out: npt.NDArray[np.float64] = step * share[:, None]
     return out
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import Run, load_filter
+from straightpcf.model.neighbourhoods import Neighbourhoods, neighbourhoods
 from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import (
     along_heights,
     held_to_lines,
+    held_where_scattered,
     limited_to_noise,
     trusted_noise_stds,
     without_tangential_motion,
@@ -70,6 +72,10 @@ def test_where_there_is_no_surface_a_step_stays_as_it_is() -> None:
     assert without_tangential_motion(step[:0], sheet_of(300)).shape == (0, 3)
 
 
+def of_first(count: int, patch: np.ndarray) -> Neighbourhoods:
+    return neighbourhoods(patch[:count], patch, 8)
+
+
 def sheet_of(count: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1, 1, (count, 3)) * [1, 1, 0]
 
@@ -79,11 +85,12 @@ def test_a_line_of_points_goes_off_it_no_farther_than_it_scatters() -> None:
     wire = np.stack([np.linspace(-1, 1, 60), *rng.normal(0, 0.002, (2, 60))], axis=1)
     wall = sheet_of(940) + np.array([0, 0, 0.5])
     drawn = np.tile([0.05, 0.0, 0.1], (60, 1))
-    left = held_to_lines(drawn, np.concatenate([wire, wall]))
+    patch = np.concatenate([wire, wall])
+    left = held_to_lines(drawn, patch, of_first(60, patch))
     np.testing.assert_allclose(left[:, 0], 0.05, atol=0.003)  # along it all is made
     assert np.abs(left[:, 2]).max() < 3 * 0.002
     back = -wire * [0, 1, 1]
-    denoised = held_to_lines(back, np.concatenate([wire, wall]))
+    denoised = held_to_lines(back, patch, of_first(60, patch))
     assert np.linalg.norm(denoised) > 0.9 * np.linalg.norm(back)
 
 
@@ -100,9 +107,23 @@ def test_a_rasters_step_across_a_slope_becomes_one_of_its_heights() -> None:
 def test_what_is_no_line_is_not_held_to_one() -> None:
     rng = np.random.default_rng(0)
     step = rng.normal(0, 0.1, (400, 3))
-    assert np.mean(np.linalg.norm(held_to_lines(step, sheet_of(1000)) - step, axis=1) > 1e-9) < 0.05
-    np.testing.assert_array_equal(held_to_lines(step[:20], np.zeros((33, 3))), step[:20])
-    assert np.isfinite(held_to_lines(step[:1], sheet_of(33))).all()
+    held = held_to_lines(step, sheet := sheet_of(1000), of_first(400, sheet))
+    assert np.mean(np.linalg.norm(held - step, axis=1) > 1e-9) < 0.05
+    nowhere, few = np.zeros((33, 3)), sheet_of(33)
+    np.testing.assert_array_equal(held_to_lines(step[:20], nowhere, of_first(20, nowhere)), step[:20])
+    assert np.isfinite(held_to_lines(step[:1], few, of_first(1, few))).all()
+
+
+def test_what_lies_in_no_surface_stays_and_what_does_moves() -> None:
+    rng = np.random.default_rng(0)
+    step = rng.normal(0, 0.01, (400, 3))
+    sheet = noisy(sheet_of(1000), 0.01)
+    assert np.linalg.norm(held_where_scattered(step, of_first(400, sheet), 0.01) - step) < 0.1 * np.linalg.norm(step)
+    crown = rng.uniform(-1, 1, (1000, 3))
+    assert np.mean(held_where_scattered(step, of_first(400, crown), 0.01) == 0) > 0.95
+    np.testing.assert_array_equal(held_where_scattered(step, of_first(400, np.zeros((1000, 3))), 0.0), step)
+    shown_larger = held_where_scattered(10 * step, of_first(400, 10 * sheet), 0.1)
+    np.testing.assert_allclose(shown_larger, 10 * held_where_scattered(step, of_first(400, sheet), 0.01))
 
 
 def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
