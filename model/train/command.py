@@ -18,6 +18,7 @@ __all__ = [
     "file_to_write",
     "noise_level",
     "positive",
+    "positive_number",
     "seed_number",
 ]
 
@@ -67,6 +68,14 @@ def noise_level(text: str) -> float:
 def positive(text: str) -> int:
     """Read a whole number of 1 or more, for argparse."""
     return _whole(text, 1)
+
+
+def positive_number(text: str) -> float:
+    """Read a finite number above 0, for argparse."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no number above 0")
+    return value
 
 
 def seed_number(text: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import torch
 from straightpcf.model.checkpoint import load_checkpoint
 from straightpcf.model.filter import DEFAULT_WEIGHTS
 from straightpcf.model.nets.straightpcf import StraightPCF
-from straightpcf.model.train import Stage, TrainStep, loop, train
+from straightpcf.model.train import Stage, TrainStep, loop, stages, train
 from straightpcf.model.train.data import Batch, PatchSource
 from straightpcf.model.train.losses import coupled_loss, velocity_loss
 from straightpcf.model.train.soap import SOAP
@@ -109,16 +110,28 @@ def test_a_later_stage_asks_for_the_one_before(data: Path, tmp_path: Path) -> No
         train("cvm", data=data, run_dir=tmp_path, iterations=1, batch_size=2, threads=1, rows=32)
 
 
-def test_the_stages_follow_each_other_and_freeze_what_they_should(
-    data: Path, tmp_path: Path, velocity_run: Path
+def test_one_call_trains_all_stages_goes_on_where_it_stopped_and_freezes_what_it_should(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    coupled = train(
-        "cvm", data=data, run_dir=tmp_path / "cvm", iterations=2, batch_size=2, threads=1, rows=32, init=velocity_run
-    )
-    full = train("dm", data=data, run_dir=tmp_path / "dm", iterations=2, batch_size=2, threads=1, rows=32, init=coupled)
-    before, after = weights(coupled), weights(full)
-    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
-    assert moved == {"distance_module"}
+    runs = [replace(run, iterations=10, batch_size=2) for run in stages.RUNS]
+    monkeypatch.setattr(stages, "RUNS", runs)
+    seen: list[tuple[str, int]] = []
+
+    def call(*, stopping: bool) -> Path | None:
+        return stages.train_stages(
+            tmp_path, data=[data], share=0.1, threads=1, rows=32,
+            on_step=lambda run, step: seen.append((run.name, step.iteration)), stop=lambda: stopping,
+        )  # fmt: skip
+
+    for _ in runs[:-1]:
+        assert call(stopping=True) is None
+    last = tmp_path / "dm" / loop.STATE_FILE
+    assert call(stopping=False) == last
+    assert seen == [(run.name, 1) for run in runs]
+    coupled, full = weights(tmp_path / "cvm" / loop.STATE_FILE), weights(last)
+    assert {name.split(".")[0] for name in full if not torch.equal(coupled[name], full[name])} == {"distance_module"}
+    assert call(stopping=False) == last
+    assert len(seen) == len(runs)  # nothing is left to do
 
 
 def test_a_resumed_run_goes_on_from_its_state(data: Path, tmp_path: Path) -> None:
