@@ -1,6 +1,7 @@
 """Print CD and P2M (x 1e4) per shape and on average, beside the noisy input and the paper's rows.
 
 python -m benchmarks.quality --split punet --resolution 10000 --noise 0.01 0.02 0.03
+python -m benchmarks.quality --model ours official jet    # and a table of all, beside the noisy input and the paper
 python -m benchmarks.quality --split validation
 python -m benchmarks.quality --split punet --resolution 50000 --noise 0    # what becomes of clean clouds
 """
@@ -54,6 +55,7 @@ Run = Callable[[Floats, float], Filtered]  # cloud, noise level
 class Row:
     """One shape at one noise level; distances x 1e4; every: CD and P2M after 1, 2, ... passes, if asked for."""
 
+    model: str
     shape: str
     resolution: int
     noise: float
@@ -72,28 +74,57 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
-    if options.every_pass and (options.model, options.iterations) != ("ours", "auto"):
+    if options.every_pass and (options.model, options.iterations) != (["ours"], "auto"):
         raise SystemExit("--every-pass takes `auto` of this project's model apart: no other --model or --iterations")
-    run = _runner(options)
+    if options.weights and len(options.model) > 1:
+        raise SystemExit("--weights are of one model: give no other --model with them")
+    runs = {model: _runner(model, options) for model in options.model}
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.open("a").close()  # what cannot be written is found out before the work
-    rows = []
+    rows: list[Row] = []
     for resolution in options.resolution:
         for noise in options.noise:
-            cell = []
-            print(f"\n{options.split}, {resolution} points, {options.noise_type} noise {noise:g}, {options.model}")
-            print(f"{'shape':14s} {'noisy CD':>9s} {'P2M':>8s}  {'CD':>9s} {'P2M':>8s}  passes  seconds")
-            for shape in _shapes(options, resolution):
-                cell.append(_measure(shape, resolution, noise, options, run))
-                _print(cell[-1])
-            _summary(cell, resolution, noise, options)
-            rows += cell
-            if options.json:
-                options.json.write_text(json.dumps(_record(options, rows), indent=1) + "\n")
+            for model, run in runs.items():
+                rows += _cell(model, resolution, noise, options, run)
+                if options.json:
+                    options.json.write_text(json.dumps(_record(options, rows), indent=1) + "\n")
+    if len(options.model) > 1:
+        _table(rows, options)
 
 
-def _measure(shape: Shape, resolution: int, noise: float, options: argparse.Namespace, run: Run) -> Row:
+def _cell(model: str, resolution: int, noise: float, options: argparse.Namespace, run: Run) -> list[Row]:
+    cell: list[Row] = []
+    print(f"\n{options.split}, {resolution} points, {options.noise_type} noise {noise:g}, {model}")
+    print(f"{'shape':14s} {'noisy CD':>9s} {'P2M':>8s}  {'CD':>9s} {'P2M':>8s}  passes  seconds")
+    for shape in _shapes(options, resolution):
+        cell.append(_measure(model, shape, resolution, noise, options, run))
+        _print(cell[-1])
+    _summary(cell, resolution, noise, options)
+    return cell
+
+
+def _table(rows: list[Row], options: argparse.Namespace) -> None:
+    """Print the means of all models, beside the noisy input's and the paper's."""
+    for resolution in options.resolution:
+        found: dict[str, dict[float, tuple[float, float]]] = {"noisy": {}, **{model: {} for model in options.model}}
+        for noise in options.noise:
+            for model in options.model:
+                of = [row for row in rows if (row.model, row.resolution, row.noise) == (model, resolution, noise)]
+                cd, p2m, before_cd, before_p2m = np.mean(
+                    [(row.cd, row.p2m, row.noisy_cd, row.noisy_p2m) for row in of], axis=0
+                )
+                found["noisy"][noise], found[model][noise] = (before_cd, before_p2m), (cd, p2m)
+            for name, cd, p2m in _paper(resolution, noise, options):
+                found.setdefault(f"paper, {name}", {})[noise] = cd, p2m
+        print(f"\n{options.split}, {resolution} points, CD / P2M")
+        print(f"{'noise':20s}" + "".join(f"{noise:>18g}" for noise in options.noise))
+        for name, cells in found.items():
+            shown = (f"{cells[n][0]:.3f} / {cells[n][1]:.3f}" if n in cells else "" for n in options.noise)
+            print(f"{name:20s}" + "".join(f"{figures:>18s}" for figures in shown))
+
+
+def _measure(model: str, shape: Shape, resolution: int, noise: float, options: argparse.Namespace, run: Run) -> Row:
     made = options.noise_type != "gaussian" or noise not in shape.noisy
     noisy = make_noise(options.noise_type, shape.clean, noise, options.seed) if made else shape.noisy[noise]
     began = time.perf_counter()
@@ -102,7 +133,7 @@ def _measure(shape: Shape, resolution: int, noise: float, options: argparse.Name
     before = _distances(noisy, shape)
     after = before if filtered.xyz is noisy else _distances(filtered.xyz, shape)
     every = tuple(_distances(xyz, shape) for xyz in filtered.every)
-    return Row(shape.name, resolution, noise, *before, *after, filtered.iterations, seconds, every)
+    return Row(model, shape.name, resolution, noise, *before, *after, filtered.iterations, seconds, every)
 
 
 def _distances(cloud: Floats, shape: Shape) -> tuple[float, float]:
@@ -118,12 +149,12 @@ def _shapes(options: argparse.Namespace, resolution: int) -> list[Shape]:
     return punet(options.data, resolution, options.shapes)
 
 
-def _runner(options: argparse.Namespace) -> Run:
-    if options.model == "noisy":
+def _runner(name: str, options: argparse.Namespace) -> Run:
+    if name == "noisy":
         return lambda cloud, _: Filtered(cloud, 0)
-    if options.model == "jet":
+    if name == "jet":
         return lambda cloud, noise: Filtered(*jet_smooth(cloud, noise))
-    if options.model == "official":
+    if name == "official":
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
         if not isinstance(module, VelocityModule):
             raise SystemExit("--model official takes the authors' single VelocityModule")
@@ -132,7 +163,7 @@ def _runner(options: argparse.Namespace) -> Run:
         model = Filter(_without_distance(network), threads=options.threads, euler_steps=OFFICIAL_STEPS, zoom=False)
     else:
         model = _ours(options)
-    told = options.iterations == "told" or (options.iterations == "auto" and options.model == "official")
+    told = options.iterations == "told" or (options.iterations == "auto" and name == "official")
 
     def run(cloud: Floats, noise: float) -> Filtered:
         wanted = str(max(1, round(100 * noise))) if told else options.iterations
@@ -251,7 +282,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--every-evaluation", action="store_true", help="evaluate every point of a patch every time")
     parser.add_argument("--without-distance", action="store_true", help="d = 1, as in the paper's ablation")
     parser.add_argument("--shapes", nargs="+", help="only these")
-    parser.add_argument("--model", choices=("ours", "official", "jet", "noisy"), default="ours")
+    parser.add_argument(
+        "--model",
+        choices=("ours", "official", "jet", "noisy"),
+        nargs="+",
+        default=["ours"],
+        help="ours, the authors' single VelocityModule through the same filter, jet smoothing of CGAL, the input",
+    )
     parser.add_argument("--weights", type=Path, help="other weights, or the state of a training run")
     parser.add_argument("--device", type=device, default="auto", help='"auto" (the default), "cpu", "cuda" or "cuda:N"')
     parser.add_argument("--threads", type=positive, help="CPU threads, all by default")

@@ -54,9 +54,12 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 def test_quality(tmp_path: Path) -> None:
     options = ("--split", "validation", "--shapes", "sphere", "--resolution", 1000, "--noise", 0.02, "--iterations", 1)
-    printed("quality", *options, "--threads", 1, "--json", tmp_path / "rows.json")
-    (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
-    assert 0 < row["cd"] < row["noisy_cd"]
+    said = printed("quality", *options, "--threads", 1, "--model", "noisy", "ours", "--json", tmp_path / "rows.json")
+    noisy, row = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert 0 < row["cd"] < row["noisy_cd"] == noisy["cd"]
+    table = [line.split() for line in said.splitlines()[-2:]]
+    for line, of in zip(table, (noisy, row), strict=True):
+        assert line == [of["model"], f"{of['cd']:.3f}", "/", f"{of['p2m']:.3f}"]
 
 
 def test_quality_of_every_pass(tmp_path: Path) -> None:
