@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["JETS", "jet_smooth"]
+__all__ = ["JETS", "check_jet", "jet_smooth"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -14,14 +16,17 @@ Floats = npt.NDArray[np.float64]
 JETS = {0.01: (24, 2), 0.02: (24, 4), 0.03: (48, 2)}
 
 
+def check_jet() -> None:
+    """End in one line where CGAL is not here, before the work of other models is done and lost."""
+    if find_spec("CGAL") is None:
+        raise SystemExit("--model jet needs CGAL's Python package: pip install 'straightpcf[benchmarks]'")
+
+
 def jet_smooth(cloud: Floats, noise: float) -> tuple[Floats, int]:
     """Smooth (N, 3) points of known noise level (Cazals and Pouget 2005, as in CGAL 6); return them and the passes."""
-    try:
-        from CGAL.CGAL_Kernel import Point_3
-        from CGAL.CGAL_Point_set_3 import Point_set_3
-        from CGAL.CGAL_Point_set_processing_3 import jet_smooth_point_set
-    except ImportError as exc:
-        raise SystemExit("--model jet needs CGAL's Python package: pip install 'straightpcf[benchmarks]'") from exc
+    from CGAL.CGAL_Kernel import Point_3
+    from CGAL.CGAL_Point_set_3 import Point_set_3
+    from CGAL.CGAL_Point_set_processing_3 import jet_smooth_point_set
 
     neighbours, passes = JETS[min(JETS, key=lambda level: abs(level - noise))]
     points = Point_set_3()

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from benchmarks.command import coverage, device, errors_in_one_line, noise_level, positive, seed_number
-from benchmarks.conventional import jet_smooth
+from benchmarks.conventional import check_jet, jet_smooth
 from benchmarks.shapes import ANALYTIC, NOISE_TYPES, Shape, analytic, make_noise, punet
 from straightpcf.model.checkpoint import load_official_checkpoint
 from straightpcf.model.filter import Filter, load_filter
@@ -153,6 +153,7 @@ def _runner(name: str, options: argparse.Namespace) -> Run:
     if name == "noisy":
         return lambda cloud, _: Filtered(cloud, 0)
     if name == "jet":
+        check_jet()
         return lambda cloud, noise: Filtered(*jet_smooth(cloud, noise))
     if name == "official":
         module = load_official_checkpoint(options.weights or options.data / "official" / "ckpt_vm.pt")
