@@ -95,11 +95,11 @@ def test_elements_before_the_vertices_are_kept(tmp_path: Path) -> None:
 def test_a_new_file_has_double_positions_and_its_attributes_typed(tmp_path: Path) -> None:
     xyz = np.add(torus(9), [500_000.123456, 5_400_000.0, 0.0])
     cloud = PointCloud(
-        xyz, {"normal": np.ones((9, 3), np.float32), "my label": np.arange(9), "text": np.array(["a"] * 9)}
+        xyz, {"feature": np.ones((9, 3), np.float32), "my label": np.arange(9), "text": np.array(["a"] * 9)}
     )
     vertex = plyfile.PlyData.read(io.BytesIO(written(tmp_path, cloud)))["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[axis] for axis in "xyz"], axis=1), xyz)
-    assert vertex["normal_2"].dtype == np.float32
+    assert vertex["feature_2"].dtype == np.float32
     np.testing.assert_array_equal(vertex["my_label"], np.arange(9))
 
 
