@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.arrays import on_host
 from straightpcf.model.calibration import Calibration
+from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import (
     HIGH_NOISE,
     is_scene,
@@ -41,6 +43,10 @@ _UNCOVERED_BELOW = 0.35
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
+# Where half of a scene's points have their nearest in a plane (std across it below a share of the lesser one along it,
+# and that above one of the greater: no line), no more noise is believed than twice what four fifths of these show.
+_SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
+_PLANE_FREEDOM = 3  # that a plane takes of its points
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
 # of how far they spread along it: the network sees noise in a tree, too.
 _FLAT_PATCH_STDS, _FLAT_RATIO = 1.3, 0.4
@@ -216,6 +222,8 @@ class NoiseReader:
         if not np.isfinite(noise_of_most) and first and self._zoom:
             noise, noise_of_most = self._reread_scene(positions, tiling, noise, raster=raster)
             parts = parts_of(noise, probes.radii, len(positions))
+        if first and self._zoom and not raster:
+            noise_of_most = min(noise_of_most, self._most_seen(positions, probes))
         distance = float(np.median(shown.usual_distances))
         return Reading(
             distance,
@@ -227,6 +235,16 @@ class NoiseReader:
             height_axis=axis,
             probes=probes,
         )
+
+    def _most_seen(self, positions: Floats, probes: Patches) -> float:
+        """Return how much noise a scene may have by its planes, infinite where it shows few.
+
+        In trees the DistanceModule reads noise, and more of it than the ground has; planes of a few points do not.
+        """
+        stds, are_planes = map(np.concatenate, zip(*self._processor.survey(positions, probes, _across), strict=True))
+        if are_planes.mean() < _SEEN_SHARE:
+            return np.inf
+        return _SEEN_RATIO * float(np.quantile(stds[are_planes], _MOST_POINTS_SHARE))
 
     def noise_left(self, positions: Floats, first: Reading, probes: Patches) -> float:
         """Return the noise std of half of a scene's points after all passes, where it was read before: in `probes`.
@@ -282,6 +300,13 @@ class NoiseReader:
 
     def _noise_std(self, distances: Floats, scales: Floats) -> float:
         return float(np.median(self.noise_stds(distances, scales)))
+
+
+def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    """Return the std of each point's neighbours across their plane, and whether they lie in one: (n,) each."""
+    near = nearest.first(_SEEN_NEIGHBOURS)
+    least, less, most = np.sqrt(np.maximum(on_host(near.variances), 0.0) / (near.local.shape[1] - _PLANE_FREEDOM)).T
+    return least, (least < _SEEN_PLANE_RATIO * less) & (less > _SEEN_LINE_RATIO * most)
 
 
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:

@@ -31,6 +31,7 @@ NOT_TUNED = {
     "low_noise.py": {"_FIT_TERMS", "_RIDGE"},  # a quadric's six
     "metrics.py": {"PAIRS_AT_ONCE", "FIRST_NEIGHBOURS", "SLIVER"},
     "neighbourhoods.py": {"_LEAST_RADIUS"},
+    "noise.py": {"_PLANE_FREEDOM"},
     "normalize.py": {"_BLOCK"},
     "normals.py": {"_CHUNK"},
     "on_device.py": {"_BATCH", "_ASKED", "_ROWS", "_MOST_GRAPHS", "_IN_FLIGHT", "_MOST_THREADS"},

@@ -144,6 +144,20 @@ def test_a_scenes_ground_is_filtered_and_its_wire_stays() -> None:
     assert result.noise_after == pytest.approx(run.frame.radius * run.reader.noise_left(left, first, first.probes))
 
 
+def test_trees_in_which_noise_is_read_stay_where_the_ground_shows_how_little_there_is() -> None:
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-20, -20, 0], [20, 20, 0], (9000, 3))
+    trees = np.concatenate([rng.normal([x, y, 3], 0.8, (700, 3)) for x in (-12, 0, 12) for y in (-12, 12)])
+    cloud = np.concatenate([noisy(ground, 0.05), trees, far_group(300.0)])
+    run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=1))
+    for _ in run.patches():
+        pass
+    assert run.frame.radius * run.readings[0].noise_of_most < 3 * 0.05
+    moved = np.linalg.norm(run.result(0.0).xyz - cloud, axis=1)
+    assert np.median(moved[9000 : 9000 + len(trees)]) < 0.01
+    assert np.sqrt(np.mean(run.result(0.0).xyz[:9000, 2] ** 2)) < 0.6 * 0.05
+
+
 def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
     cloud = np.concatenate([noisy(torus(9000), 0.07), far_group(300.0)])
     run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=2))
