@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import numpy.typing as npt
 
@@ -18,8 +16,10 @@ JETS = {0.01: (24, 2), 0.02: (24, 4), 0.03: (48, 2)}
 
 def check_jet() -> None:
     """End in one line where CGAL is not here, before the work of other models is done and lost."""
-    if find_spec("CGAL") is None:
-        raise SystemExit("--model jet needs CGAL's Python package: pip install 'straightpcf[benchmarks]'")
+    try:
+        from CGAL import CGAL_Kernel, CGAL_Point_set_3, CGAL_Point_set_processing_3  # noqa: F401 - whether they load
+    except ImportError as exc:
+        raise SystemExit("--model jet needs CGAL's Python package: pip install 'straightpcf[benchmarks]'") from exc
 
 
 def jet_smooth(cloud: Floats, noise: float) -> tuple[Floats, int]:

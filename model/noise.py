@@ -46,6 +46,7 @@ _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is belie
 # Where half of a scene's points have their nearest in a plane (std across it below a share of the lesser one along it,
 # and that above one of the greater: no line), no more noise is believed than twice what four fifths of these show.
 _SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
+_EXACT_PLANE_RATIO = 1e-3  # below it a plane is drawn, not scanned: of the noise beside it it says nothing
 _PLANE_FREEDOM = 3  # that a plane takes of its points
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
 # of how far they spread along it: the network sees noise in a tree, too.
@@ -303,10 +304,11 @@ class NoiseReader:
 
 
 def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Return the std of each point's neighbours across their plane, and whether they lie in one: (n,) each."""
+    """Return the std of each point's neighbours across their plane, and whether that tells noise: (n,) each."""
     near = nearest.first(_SEEN_NEIGHBOURS)
     least, less, most = np.sqrt(np.maximum(on_host(near.variances), 0.0) / (near.local.shape[1] - _PLANE_FREEDOM)).T
-    return least, (least < _SEEN_PLANE_RATIO * less) & (less > _SEEN_LINE_RATIO * most)
+    is_plane = (least > _EXACT_PLANE_RATIO * less) & (least < _SEEN_PLANE_RATIO * less)
+    return least, is_plane & (less > _SEEN_LINE_RATIO * most)
 
 
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:

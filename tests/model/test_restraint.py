@@ -158,6 +158,16 @@ def test_trees_in_which_noise_is_read_stay_where_the_ground_shows_how_little_the
     assert np.sqrt(np.mean(run.result(0.0).xyz[:9000, 2] ** 2)) < 0.6 * 0.05
 
 
+def test_what_is_noisy_is_filtered_beside_a_floor_without_noise() -> None:
+    rng = np.random.default_rng(0)
+    floor, wall = rng.uniform([-20, -20, 0], [20, 20, 0], (12_000, 3)), rng.uniform([-10, 0, 0], [10, 0, 6], (2500, 3))
+    cloud = np.concatenate([floor, noisy(wall, 0.05), far_group(300.0)])
+    run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=1))
+    for _ in run.patches():
+        pass
+    assert np.sqrt(np.mean(run.result(0.0).xyz[12_000:14_500, 1] ** 2)) < 0.8 * 0.05
+
+
 def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
     cloud = np.concatenate([noisy(torus(9000), 0.07), far_group(300.0)])
     run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=2))
