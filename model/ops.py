@@ -20,7 +20,7 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
     if x.is_cuda:
         from straightpcf.model.kernels import cuda
 
-        if x.shape[1] <= cuda.MOST_POINTS and cuda.load():
+        if x.shape[1] <= cuda.MOST_POINTS and k <= cuda.MOST_NEIGHBOURS and cuda.load():
             return cuda.knn(x.detach(), k, rows)
     library = cpu.load() if x.device.type == "cpu" and x.dtype == torch.float32 and k <= 64 else None
     return knn_torch(x, k, rows) if library is None else cpu.knn(library, x, k, rows)

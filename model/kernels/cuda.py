@@ -19,10 +19,22 @@ try:
 except ImportError:  # a CPU build of torch comes without it
     triton = None
 
-__all__ = ["EDGES", "MOST_FARTHEST", "MOST_POINTS", "EdgeMax", "edge_max", "farthest", "knn", "load", "load_gradient"]
+__all__ = [
+    "EDGES",
+    "MOST_FARTHEST",
+    "MOST_NEIGHBOURS",
+    "MOST_POINTS",
+    "EdgeMax",
+    "edge_max",
+    "farthest",
+    "knn",
+    "load",
+    "load_gradient",
+]
 
-MOST_POINTS = 2048  # of a patch; its indices fill the low bits of a key, and a warp's registers hold two rows of keys
-_ROWS = 2
+MOST_POINTS = 2048  # of a patch; its indices fill the low bits of a key, and a warp's registers hold a row of keys
+MOST_NEIGHBOURS = 32  # of the 64 keys that bound them
+_LANES = 32  # of a warp
 _DIRECT = 8  # with fewer channels distances are differences, exact; with more, products
 EDGES = 32  # of a point, for the gradient: an edge's number fills the low bits of a sum
 # The tilings are what was fastest of some dozens on an H200 (docs/kernels.md).
@@ -59,21 +71,21 @@ def _proven(prove: Callable[[torch.device, int], None]) -> bool:
 
 
 def knn(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
-    """Do what `ops.knn` does for at most MOST_POINTS points a patch; returns int32 indices.
+    """Do what `ops.knn` does for at most MOST_POINTS points a patch and MOST_NEIGHBOURS; returns int32 indices.
 
     Squared distances that agree in their leading bits, 12 at least and mostly 15 or more, go by index.
     """
     batch, points, channels = x.shape
-    if points > MOST_POINTS:
-        raise ValueError(f"a patch of {points} points; the kernel takes {MOST_POINTS}")
+    if points > MOST_POINTS or k > MOST_NEIGHBOURS:
+        raise ValueError(f"{k} of {points} points of a patch; the kernel finds {MOST_NEIGHBOURS} of {MOST_POINTS}")
     out = torch.empty(batch, rows, k, dtype=torch.int32, device=x.device)
-    direct, size = channels < _DIRECT, triton.next_power_of_2(points)
+    direct, size = channels < _DIRECT, max(_LANES, triton.next_power_of_2(points))
     given = squares = x.contiguous()
     if not direct:
         given, squares = torch.bmm(x[:, :rows], x.mT), x.square().sum(dim=2)
-    _nearest[batch, triton.cdiv(rows, _ROWS)](
+    _nearest[batch, rows](
         given, squares, out, points, rows,
-        CHANNELS=channels if direct else 0, K=k, ROWS=_ROWS, POINTS=size, ROOM=31 - size.bit_length(), num_warps=1,
+        CHANNELS=channels if direct else 0, K=k, POINTS=size, LANES=_LANES, ROOM=31 - size.bit_length(), num_warps=1,
     )  # fmt: skip
     return out
 
@@ -226,43 +238,59 @@ if triton is not None:
     @triton.jit  # type: ignore[untyped-decorator]
     def _nearest(  # type: ignore[no-untyped-def]
         x, squares, out, points, rows,
-        CHANNELS: tl.constexpr, K: tl.constexpr, ROWS: tl.constexpr, POINTS: tl.constexpr, ROOM: tl.constexpr,
+        CHANNELS: tl.constexpr, K: tl.constexpr, POINTS: tl.constexpr, LANES: tl.constexpr, ROOM: tl.constexpr,
     ):  # fmt: skip
-        """Select the K nearest of all points for ROWS points of one patch, by K minima inside one warp.
+        """Select the K nearest of all points for one point of a patch, inside one warp, in any order.
 
         x: the points' CHANNELS coordinates, or where CHANNELS is 0 the products of rows with points, and `squares`
         their squared lengths. A key is ROOM bits of a distance above the point's index: one comparison finds both.
         """
-        patch = tl.program_id(0).to(tl.int64)
-        i = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
+        patch, i = tl.program_id(0).to(tl.int64), tl.program_id(1)
         j = tl.arange(0, POINTS)
-        there = (i < rows)[:, None] & (j < points)[None, :]
+        valid = (j < points) & (j != i)
         if CHANNELS > 0:
-            distance = tl.zeros([ROWS, POINTS], tl.float32)
+            distance = tl.zeros([POINTS], tl.float32)
             for c in tl.static_range(CHANNELS):
-                own = tl.load(x + (patch * points + i) * CHANNELS + c, mask=i < rows, other=0.0)
-                other = tl.load(x + (patch * points + j) * CHANNELS + c, mask=j < points, other=0.0)
-                apart = own[:, None] - other[None, :]
+                own = tl.load(x + (patch * points + i) * CHANNELS + c)
+                apart = own - tl.load(x + (patch * points + j) * CHANNELS + c, mask=j < points, other=0.0)
                 distance += apart * apart
         else:
-            own = tl.load(squares + patch * points + i, mask=i < rows, other=0.0)
+            own = tl.load(squares + patch * points + i)
             other = tl.load(squares + patch * points + j, mask=j < points, other=0.0)
-            product = tl.load(x + (patch * rows + i)[:, None] * points + j[None, :], mask=there, other=0.0)
-            distance = tl.maximum(own[:, None] + other[None, :] - 2.0 * product, 0.0)
+            product = tl.load(x + (patch * rows + i) * points + j, mask=j < points, other=0.0)
+            distance = tl.maximum(own + other - 2.0 * product, 0.0)
         # As integers, squared distances keep their order; of what they are above the row's least, the leading bits fit.
-        valid = there & (j[None, :] != i[:, None])
         bits = distance.to(tl.int32, bitcast=True)
-        least = tl.min(tl.where(valid, bits, 0x7FFFFFFF), axis=1)
-        reach = tl.maximum(tl.max(tl.where(valid, bits, 0), axis=1) - least, 0)
+        least = tl.min(tl.where(valid, bits, 0x7FFFFFFF), axis=0)
+        reach = tl.maximum(tl.max(tl.where(valid, bits, 0), axis=0) - least, 0)
         length = (reach.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 126  # in bits: the exponent of a float
-        key = ((bits - least[:, None]) >> tl.maximum(length - ROOM, 0)[:, None]) * POINTS + j[None, :]
-        key = tl.where(valid, key, 0x7FFFFFFF)
-        last = tl.zeros([ROWS], tl.int32)
-        for n in range(K):
-            nearest = tl.min(key, axis=1)
-            last = tl.where(nearest < 0x7FFFFFFF, nearest & (POINTS - 1), last)  # too few points: the farthest again
-            tl.store(out + (patch * rows + i) * K + n, last, mask=i < rows)
-            key = tl.where(key == nearest[:, None], 0x7FFFFFFF, key)
+        key = tl.where(valid, ((bits - least) >> tl.maximum(length - ROOM, 0)) * POINTS + j, 0x7FFFFFFF)
+        # The K-th of each lane's two least keys, found bit by bit, bounds the K-th of all: some K + 4 keep to it.
+        lanes = tl.reshape(key, (POINTS // LANES, LANES))  # the first axis lies within a lane: no key changes places
+        first = tl.min(lanes, axis=0)
+        second = tl.min(tl.where(lanes == first[None, :], 0x7FFFFFFF, lanes), axis=0)
+        bound = 0
+        for n in range(31):
+            higher = bound | (1 << (30 - n))
+            below = tl.sum((first < higher).to(tl.int32) + (second < higher).to(tl.int32), axis=0)
+            bound = tl.where(below < K, higher, bound)
+        bound = tl.minimum(bound, 0x7FFFFFFE)  # where all are too few it is no point's
+        count = tl.sum((key <= bound).to(tl.int32), axis=0)
+        while count > K:
+            bound = tl.max(tl.where(key < bound, key, 0), axis=0)
+            count -= 1
+        chosen = key <= bound
+        # Each finds its place by counting those before it, lane by lane.
+        taken = tl.reshape(chosen.to(tl.int32), (POINTS // LANES, LANES))
+        lane = tl.sum(taken, axis=0)
+        start = tl.cumsum(lane, axis=0) - lane
+        place = tl.reshape(start[None, :] + tl.cumsum(taken, axis=0) - taken, (POINTS,))
+        to = out + (patch * rows + i) * K
+        tl.store(to + place, key & (POINTS - 1), mask=chosen)
+        if count < K:  # too few points: the farthest again
+            rest = tl.arange(0, LANES)
+            last = tl.max(tl.where(chosen, key, 0), axis=0) & (POINTS - 1)
+            tl.store(to + rest, tl.full([LANES], 0, tl.int32) + last, mask=(rest >= count) & (rest < K))
 
     @triton.jit  # type: ignore[untyped-decorator]
     def _edges(index, patch, first, rows, K: tl.constexpr, ROWS: tl.constexpr):  # type: ignore[no-untyped-def]
