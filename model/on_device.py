@@ -38,7 +38,7 @@ Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], tor
 Compute = Callable[..., torch.Tensor]  # how many of a patch's points, and tensors (B, ...) -> what is made of them
 _Key = tuple[int, int, int]  # patches, rows, tensors
 _BATCH = 32
-_ROWS = 128  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
+_ROWS = 64  # counts of rows are rounded up to a multiple: few shapes, and a graph for each
 _ASKED = 8  # so are those of patches of which only d is asked
 _MOST_GRAPHS = 16
 _IN_FLIGHT = 2  # batches of which the results have not been read
@@ -140,7 +140,12 @@ class OnDevice:
 
         Raises TooLarge where it has no memory for one patch.
         """
-        points, sent = self._sent(positions, cut, scales, known_distances)
+        # A batch makes as many rows as its patch that owns most: those that own about as many go together.
+        order = np.argsort(cut.owned, kind="stable")
+        cut, scales = cut[order], scales[order]
+        places = enumerate(order.tolist())
+        known = {place: known_distances[patch] for place, patch in places if patch in known_distances}
+        points, sent = self._sent(positions, cut, scales, known)
         heard: _Heard | None = None
         if agree:
             with current(self.device), enough_memory(self.device, len(positions)):
@@ -160,9 +165,9 @@ class OnDevice:
                 continue
             first = chosen.stop
             if len(waiting) == _IN_FLIGHT:
-                yield from self._finished(*waiting.popleft(), cut, finish)
+                yield from self._finished(*waiting.popleft(), cut, order, finish)
         for batch, result in waiting:
-            yield from self._finished(batch, result, cut, finish)
+            yield from self._finished(batch, result, cut, order, finish)
 
     @torch.inference_mode()
     def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
@@ -240,10 +245,12 @@ class OnDevice:
         self._asked.clear()
         torch.cuda.empty_cache()
 
-    def _finished(self, batch: range, result: _Result, cut: Patches, finish: Finish[_T]) -> Iterator[_T]:
+    def _finished(
+        self, batch: range, result: _Result, cut: Patches, order: npt.NDArray[np.int64], finish: Finish[_T]
+    ) -> Iterator[_T]:
         moves = result.read().astype(np.float64)
-        owned = (move[: cut.owned[patch]] for patch, move in zip(batch, moves, strict=True))
-        yield from self._pool.map(finish, batch, owned)
+        owned = (move[: cut.owned[place]] for place, move in zip(batch, moves, strict=True))
+        yield from self._pool.map(finish, order[batch].tolist(), owned)
 
     @torch.inference_mode()
     def _hear(self, points: torch.Tensor, sent: _DeviceCut, heard: _Heard, some: slice) -> int:

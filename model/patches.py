@@ -36,8 +36,8 @@ class Patches:
         """Return each step-th patch."""
         return self[slice(None, None, step)]
 
-    def __getitem__(self, some: slice | npt.NDArray[np.bool_]) -> Patches:
-        """Return some of the patches, in their order."""
+    def __getitem__(self, some: slice | npt.NDArray[np.bool_ | np.int64]) -> Patches:
+        """Return some of the patches, in their order, or in that of the numbers given."""
         return Patches(self.seeds[some], self.index[some], self.owned[some], self.radii[some])
 
     def of_rows(self, rows: npt.NDArray[np.int64]) -> Patches:

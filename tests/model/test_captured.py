@@ -105,7 +105,7 @@ def test_a_batch_waits_for_nothing(known_distances: dict[int, float], *, agree: 
         return run, run()
 
     rows, each = np.arange(40), np.ones(40)
-    cut = Patches(rows, np.zeros((40, 1000), np.int32), 9 * rows + 1, each)
+    cut = Patches(rows, np.zeros((40, 1000), np.int32), 4 * rows + 1, each)
     processor = OnDevice(model, "meta", batch=8, capture=capture)
     points = torch.empty(5000, 3, dtype=torch.float64, device=DEVICE)
     sent = _DeviceCut.of(cut, each, known_distances, DEVICE)
@@ -116,7 +116,7 @@ def test_a_batch_waits_for_nothing(known_distances: dict[int, float], *, agree: 
                 assert processor._hear(points, sent, heard, slice(first, first + 8)) == 8
         for first in range(0, 40, 8):
             assert processor._launch(points, cut, sent, range(first, first + 8), heard).shape[0] == 8
-    # Rows up to 128 and to 256 come twice, up to 384 once; the first evaluation is of all points.
+    # Rows up to 64 and to 128 come twice, up to 192 once; the first evaluation is of all points.
     assert len(captured) == (3 if agree else 2)
 
 

@@ -105,9 +105,9 @@ def test_a_shape_is_captured_when_it_comes_again_and_reads_fresh_inputs() -> Non
     graphs = Graphs(compute, capture)
     for turn in range(4):
         x, owned = torch.rand(2, 1000, 3), torch.tensor([turn, 1])
-        torch.testing.assert_close(graphs(400, x, owned), x[:, :512] * owned[:, None, None])
+        torch.testing.assert_close(graphs(400, x, owned), x[:, :448] * owned[:, None, None])
         distance = torch.rand(2, 1)
-        expected = x[:, :1000] * (owned[:, None] * distance)[:, :, None]
+        expected = x[:, :960] * (owned[:, None] * distance)[:, :, None]
         torch.testing.assert_close(graphs(950, x, owned, distance), expected)
         graphs(700, torch.rand(2, 700, 3), owned)  # patches of small clouds have a size each: no graphs for them
         assert len(captured) == (2 if turn else 0)
@@ -135,6 +135,22 @@ def test_the_graph_that_was_used_last_is_given_up_last() -> None:
     assert len(captured) == 17
     call(2)
     assert len(captured) == 18
+
+
+def test_patches_that_own_about_as_many_points_go_together(
+    network: StraightPCF, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = sphere(8000, 0)
+    cut = next(Tiling(ball, split(ball, 10_000), coverage=3, seed=0).cuts())
+    processor, made = OnDevice(Filter(network, threads=1), "cpu", batch=4, capture=capture_by_calling), []
+    monkeypatch.setattr(processor, "_moves", lambda rows, x, *_: made.append(rows) or x[:, :rows])
+    finished = dict(
+        processor.displacements(
+            ball, cut, np.ones(len(cut.seeds)), {}, lambda patch, moves: (patch, len(moves)), agree=False
+        )
+    )
+    assert finished == dict(enumerate(cut.owned.tolist()))
+    assert made == np.sort(cut.owned)[[3, 7, 11, 15, 19, 23]].tolist()
 
 
 def test_where_capturing_fails_the_work_goes_on_without_graphs(network: StraightPCF) -> None:
