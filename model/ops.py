@@ -6,7 +6,9 @@ import torch
 
 from straightpcf.model.kernels import cpu
 
-__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "squared_distances"]
+__all__ = ["edge_max", "edge_max_torch", "for_products", "knn", "knn_torch", "squared_distances"]
+
+_DIRECT = 8  # of fewer channels distances are differences, and products are exact
 
 
 def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
@@ -29,7 +31,7 @@ def knn(x: torch.Tensor, k: int, rows: int | None = None) -> torch.Tensor:
 def knn_torch(x: torch.Tensor, k: int, rows: int) -> torch.Tensor:
     """Do what `knn` does with a full distance matrix and `torch.topk`."""
     x = x.detach()
-    if x.shape[2] < 8:  # exact differences where they are cheap
+    if x.shape[2] < _DIRECT:  # exact differences where they are cheap
         distance = squared_distances(x[:, :rows], x)
     else:
         distance = torch.cdist(x[:, :rows], x, compute_mode="use_mm_for_euclid_dist")
@@ -52,6 +54,18 @@ def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return distance
 
 
+def for_products(x: torch.Tensor) -> torch.Tensor:
+    """Return features (..., C) float32 as the layers per point take them: on a GPU without gradient in float16.
+
+    So are the products over edges that come of them; sums are of float32, and positions stay as they are.
+    """
+    if not x.is_cuda or torch.is_grad_enabled() or x.shape[-1] < _DIRECT:
+        return x
+    from straightpcf.model.kernels import cuda
+
+    return x.half() if cuda.load() else x
+
+
 def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Take the maximum over a point's edges of the second layer of an EdgeConv.
 
@@ -70,7 +84,7 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     plain = whole and a.dtype == torch.float32 and index.dtype == torch.int32
     library = cpu.load() if plain and a.device.type == "cpu" else None
     if library is None:
-        return edge_max_torch(a, b, index, weight)
+        return edge_max_torch(a.to(weight.dtype), b.to(weight.dtype), index, weight)
     return cpu.EdgeMax.apply(library, a, b, index, weight, want_grad)  # type: ignore[no-untyped-call,no-any-return]
 
 
