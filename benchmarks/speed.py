@@ -106,7 +106,7 @@ class _Counting:
     def __init__(self, processor: Processor) -> None:
         self._processor, self.done = processor, list[tuple[int, int]]()
         self.distances, self.spread, self.survey = processor.distances, processor.spread, processor.survey
-        self.nearest_others = processor.nearest_others
+        self.spacings = processor.spacings
 
     def displacements(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],

@@ -198,10 +198,15 @@ class OnDevice:
         return moved
 
     @torch.inference_mode()
-    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> npt.NDArray[np.int32]:
-        """Look up the nearest others of each point in the patch that owns it. Raises TooLarge as `spread` does."""
+    def spacings(self, positions: Floats, tiling: Tiling, count: int) -> tuple[Floats, Floats]:
+        """Look for the neighbours of each point in the patch that owns it. Raises TooLarge as `spread` does."""
         with current(self.device), enough_memory(self.device, len(positions)):
-            return self._around(torch.from_numpy(positions).to(self.device), tiling, count).cpu().numpy()
+            points = torch.from_numpy(positions).to(self.device)
+            around = self._around(points, tiling, count).long()
+            reach = (points[around[:, -1]] - points).norm(dim=1)
+            rising, found = reach[around].sort(dim=1).values, around.shape[1]
+            among = (rising[:, (found - 1) // 2] + rising[:, found // 2]) / 2
+            return reach.cpu().numpy(), among.cpu().numpy()
 
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
         """Look at all patches at once. Raises TooLarge where the device has no memory for them."""

@@ -90,7 +90,7 @@ class OnHost:
             moved[rows[:own]] = near[:own]
         return moved
 
-    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> None:
+    def spacings(self, positions: Floats, tiling: Tiling, count: int) -> None:
         """Leave that to a tree."""
 
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:

@@ -10,6 +10,8 @@ from straightpcf.model.distinct import box_of, half_reach
 from straightpcf.model.normalize import CloudFrame, is_scene
 from straightpcf.model.patches import PATCH_SIZE
 
+Floats = npt.NDArray[np.float64]
+
 __all__ = ["FAR_OUT", "NEIGHBOURS", "far_out", "isolated"]
 
 # A row so many times as far out as half of the rows are is a file's sign for "no data". With it, float64 would hold all
@@ -32,7 +34,7 @@ _PROBES = 48
 _BLOCK = 2**16  # points whose neighbours are held at once
 
 
-def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def far_out(xyz: Floats) -> npt.NDArray[np.bool_]:
     """Say of each finite row (N, 3) whether it is too far from the others to be a point of the cloud: (N,)."""
     none = np.zeros(len(xyz), dtype=bool)
     if len(xyz) == 0:
@@ -45,20 +47,14 @@ def far_out(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return far
 
 
-def isolated(
-    xyz: npt.NDArray[np.float64], *, workers: int = 1, nearest: npt.NDArray[np.int32] | None = None
-) -> npt.NDArray[np.bool_]:
+def isolated(xyz: Floats, *, workers: int = 1, spacings: tuple[Floats, Floats] | None = None) -> npt.NDArray[np.bool_]:
     """Say of each point of an object (N, 3) whether it lies apart from all others: (N,).
 
     None does in a scene, whose far parts are sparse, and where more than _MOST_SHARE would. Where some do, everyone's
-    patches have a few, which read as noise that the whole cloud has. nearest: (N, 8) rows of each point's nearest
-    others, nearest first, where they have been looked up.
+    patches have a few, which read as noise that the whole cloud has. spacings: (N,) each, where they are known: how far
+    each point's 8th neighbour is, and the median of what that is of its 8 nearest.
     """
-    if nearest is None:
-        beside_most, beside_neighbours = _distances(xyz, workers)
-    else:
-        reach = np.linalg.norm(xyz.take(nearest[:, -1], axis=0) - xyz, axis=1)
-        beside_most, beside_neighbours = _compared(reach, nearest)
+    beside_most, beside_neighbours = _beside(*(spacings or _spacings(xyz, workers)))
     apart = (beside_most > _FAR_RATIO) | (beside_neighbours > _FAR_NEIGHBOUR_RATIO)
     sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _SHEET_NEIGHBOUR_RATIO), workers)
     apart &= ~sheet
@@ -71,7 +67,7 @@ def isolated(
         return np.zeros_like(apart)
     for _ in range(0 if few else _ROUNDS):
         rows = np.flatnonzero(~apart)
-        beside_most, beside_neighbours = _distances(xyz[rows], workers)
+        beside_most, beside_neighbours = _beside(*_spacings(xyz[rows], workers))
         found = ((beside_most > _NEXT_RATIO) | (beside_neighbours > _NEXT_NEIGHBOUR_RATIO)) & ~sheet[rows]
         if not found.any() or apart.sum() + found.sum() > _MOST_SHARE * len(xyz):
             break
@@ -79,31 +75,28 @@ def isolated(
     return apart
 
 
-def _distances(xyz: npt.NDArray[np.float64], workers: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return how far each point's 8th neighbour is, beside most points and beside its own neighbours: (N,) each."""
+def _spacings(xyz: Floats, workers: int) -> tuple[Floats, Floats]:
+    """Return how far each point's 8th neighbour is, and the median of what that is of its nearest: (N,) each."""
     count = min(NEIGHBOURS, len(xyz) - 1)
-    tree, reach = cKDTree(xyz), np.empty(len(xyz))
+    tree, reach, among = cKDTree(xyz), np.empty(len(xyz)), np.empty(len(xyz))
     around = np.empty((len(xyz), count), dtype=np.int32)
     for start in range(0, len(xyz), _BLOCK):
         some = slice(start, start + _BLOCK)
         distance, index = tree.query(xyz[some], k=np.arange(2, count + 2), workers=workers)
         reach[some], around[some] = distance[:, -1], index
-    return _compared(reach, around)
-
-
-def _compared(
-    reach: npt.NDArray[np.float64], around: npt.NDArray[np.int32]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return distances (N,) beside those of most points, and beside those of each point's neighbours (N, k)."""
-    of_neighbours, count = np.empty(len(reach)), around.shape[1]
-    for start in range(0, len(reach), _BLOCK):
+    for start in range(0, len(xyz), _BLOCK):
         some = slice(start, start + _BLOCK)
         rising = np.sort(reach.take(around[some]), axis=1)  # of few, sooner than np.median finds the middle
-        of_neighbours[some] = (rising[:, (count - 1) // 2] + rising[:, count // 2]) / 2
-    return reach / max(np.quantile(reach, _DENSE_QUANTILE), 1e-300), reach / np.maximum(of_neighbours, 1e-300)
+        among[some] = (rising[:, (count - 1) // 2] + rising[:, count // 2]) / 2
+    return reach, among
 
 
-def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], workers: int) -> npt.NDArray[np.bool_]:
+def _beside(reach: Floats, among: Floats) -> tuple[Floats, Floats]:
+    """Return distances (N,) beside those of most points, and beside those of each point's neighbours."""
+    return reach / max(np.quantile(reach, _DENSE_QUANTILE), 1e-300), reach / np.maximum(among, 1e-300)
+
+
+def _on_a_sheet(xyz: Floats, asked: npt.NDArray[np.bool_], workers: int) -> npt.NDArray[np.bool_]:
     """Say of each point of a cloud (N, 3) that is `asked` about, (N,), whether it is part of a sheet or a line: (N,).
 
     Those nearest to it lie in one, and so do those nearest to most of them: a few points lie flat by chance.
@@ -125,7 +118,7 @@ def _on_a_sheet(xyz: npt.NDArray[np.float64], asked: npt.NDArray[np.bool_], work
     return sheet
 
 
-def _is_scene(xyz: npt.NDArray[np.float64]) -> bool:
+def _is_scene(xyz: Floats) -> bool:
     size = min(PATCH_SIZE, len(xyz))
     radii = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // _PROBES)], k=[size])[0]
     return is_scene(float(np.median(radii)) / max(CloudFrame.of(xyz).radius, 1e-300))

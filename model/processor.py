@@ -73,10 +73,10 @@ class Processor(Protocol):
     def distances(self, positions: Floats, cut: Patches, scales: Floats) -> Floats:
         """Return what the DistanceModule says of each patch: (M,)."""
 
-    def nearest_others(self, positions: Floats, tiling: Tiling, count: int) -> npt.NDArray[np.int32] | None:
-        """Return the rows of each point's nearest others, nearest first, (N, count); None where a tree is as quick.
+    def spacings(self, positions: Floats, tiling: Tiling, count: int) -> tuple[Floats, Floats] | None:
+        """Return how far the last of each point's `count` neighbours is, and the median of what that is of these.
 
-        tiling: of these positions.
+        (N,) each; None where a tree is as quick. tiling: of these positions.
         """
 
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:

@@ -122,8 +122,8 @@ class Run:
         positions = self.frame.enter(self.points.xyz)
         self._first = self._tiling(positions)
         self._first.expect_parts()
-        nearest = self.filter.processor.nearest_others(positions, self._first, NEIGHBOURS)
-        apart = isolated(positions, workers=self.filter.threads, nearest=nearest)
+        spacings = self.filter.processor.spacings(positions, self._first, NEIGHBOURS)
+        apart = isolated(positions, workers=self.filter.threads, spacings=spacings)
         return apart[self.points.inverse]
 
     def patches(self) -> Iterator[FinishedPatch]:

@@ -84,11 +84,12 @@ def test_points_in_the_air_are_found_among_their_patches_as_in_the_whole_cloud(
     ball, air = sphere(count, 0), np.random.default_rng(0).uniform(-3, 3, (30, 3))
     cloud = np.vstack([ball, air]) / 6
     tiling = Tiling(cloud, split(cloud, 10_000), coverage=3, seed=0)
-    nearest = on_device(network).processor.nearest_others(cloud, tiling, 8)
-    assert nearest is not None
-    _, expected = cKDTree(cloud).query(cloud, k=np.arange(2, 10))
-    assert (nearest == expected).mean() > 0.99
-    np.testing.assert_array_equal(isolated(cloud, nearest=nearest), isolated(cloud))
+    spacings = on_device(network).processor.spacings(cloud, tiling, 8)
+    assert spacings is not None
+    distances, nearest = cKDTree(cloud).query(cloud, k=np.arange(2, 10))
+    expected = distances[:, -1], np.median(distances[nearest, -1], axis=1)
+    assert (np.isclose(spacings, expected).mean(axis=1) > 0.99).all()
+    np.testing.assert_array_equal(isolated(cloud, spacings=spacings), isolated(cloud))
     assert isolated(cloud)[-30:].any()
 
 
