@@ -275,10 +275,13 @@ class Engine:
             news = self._news_of(id)
             record = await self._same(id, owner, folder)
             folder = record.folder
-            for event in await self._call(JobStore.events, id, after):
+            events = await self._call(JobStore.events, folder, after)
+            for event in events:
                 after = event.seq
                 yield event
             if record.finished:
+                if not events:  # deleted between the two looks, it would seem to have told its end
+                    await self._same(id, owner, folder)
                 return
             await self._further(news)
 

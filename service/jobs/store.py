@@ -137,10 +137,10 @@ class JobStore:
         records = [record_of(row, queued.get(row["seq"])) for row in rows[:limit]]
         return records, str(rows[limit - 1]["seq"]) if more else None
 
-    def events(self, id: str, after: int = 0) -> list[JobEvent]:
-        """Return what happened behind event `after`."""
-        query = "SELECT e.* FROM events e JOIN jobs j ON e.job = j.seq WHERE j.id = ? AND e.seq > ? ORDER BY e.seq"
-        return [event_of(row) for row in self._db.execute(query, (id, after))]
+    def events(self, folder: str, after: int = 0) -> list[JobEvent]:
+        """Return what happened to the job of a folder behind event `after`: its id may be another's by now."""
+        query = "SELECT e.* FROM events e JOIN jobs j ON e.job = j.seq WHERE j.folder = ? AND e.seq > ? ORDER BY e.seq"
+        return [event_of(row) for row in self._db.execute(query, (folder, after))]
 
     def request_cancel(self, id: str, folder: str, *, expires_in: float) -> None:
         """Cancel a queued job at once; mark one that is worked on, for its server to see; NotFound if it is another."""

@@ -107,6 +107,36 @@ def test_a_result_that_is_deleted_before_it_is_opened_is_not_found(
     assert not [record for record in caplog.records if record.exc_info]
 
 
+def test_who_follows_a_job_that_is_deleted_is_told_so_and_not_that_this_was_all(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with (
+            serving(tmp_path, willing(), grpc_port=(port := free_port())) as (engine, host, http),
+            grpc.aio.insecure_channel(f"{host}:{port}") as channel,
+            httpx2.AsyncClient(base_url=f"http://{host}:{http}") as client,
+        ):
+            stub = DenoiseServiceStub(channel)
+            look = engine._same
+
+            async def looked_and_lost(id: str, owner: str, folder: str | None) -> Any:
+                record = await look(id, owner, folder)
+                engine._same = look  # type: ignore[method-assign]
+                await engine.delete(id, owner=owner)
+                return record
+
+            for is_rest in (False, True):
+                job = await stub.CreateJob(create_parts())
+                await engine.wait(job.id)
+                engine._same = looked_and_lost  # type: ignore[method-assign]
+                if is_rest:  # 204 would say that its end was told before
+                    assert (await client.get(f"/jobs/{job.id}/events")).status_code == 404
+                    continue
+                with pytest.raises(grpc.RpcError) as caught:
+                    _ = [event async for event in stub.WatchJob(pb.WatchJobRequest(id=job.id))]
+                assert caught.value.code().name == "NOT_FOUND"
+
+    play(scenario)
+
+
 def _delete_between(engine: Engine) -> None:
     found = engine.result
 
