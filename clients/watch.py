@@ -33,18 +33,30 @@ def watch_folder(
     have worked on a result. A file is taken when its size and time have not changed for a second, so that one
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
     server could not be had, at the next look, or, where the disk was full or `target` away, when more of it is free
-    or it is back. A server that has lost a job, with its data, gets it once more. Yields each outcome. once: look
-    once, and end.
+    or it is back. A server that has lost a job, with its data, gets it once more. A `folder` that is away, as a share
+    may be, is said once, and waited for. Yields each outcome. once: look once, and end.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
     tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
     full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
     lost: dict[Path, Stamp] = {}
     before: dict[Path, Stamp] = {}
+    is_away = False
     while True:
+        try:
+            inside = sorted(folder.iterdir())
+        except OSError as error:
+            if once:
+                raise
+            if not is_away:
+                yield folder, error
+            is_away = True
+            time.sleep(LOOK_SECONDS)
+            continue
+        is_away = False
         seen = {
             path: stamp
-            for path in sorted(folder.iterdir())
+            for path in inside
             if path.suffix.lower() in suffixes and not path.name.startswith(".") and (stamp := _stamp(path))
         }
         for path, stamp in seen.items():
@@ -69,7 +81,7 @@ def watch_folder(
                     full[path] = shutil.disk_usage(target).free
                 elif not target.is_dir():
                     full[path] = -1
-                else:
+                elif _stamp(path) is not None:  # else it is gone, or its folder is away: it may come back as it was
                     tried[path] = stamp
                 yield path, error
             else:

@@ -230,6 +230,30 @@ def test_a_folder_for_results_that_goes_away_and_comes_back_is_no_failure_of_the
     assert next(outcomes) == "first"
 
 
+def test_a_folder_that_goes_away_and_comes_back_is_watched_on_with_what_was_in_work(
+    server: RunningServer, tmp_path: Path, folder: Path
+) -> None:
+    away = tmp_path.with_name("away")
+    (results := tmp_path.with_name("results")).mkdir()
+    (folder / "scan.ply").unlink()
+    np.save(folder / "scan.npy", torus(400))
+    asked: list[str] = []
+    with Client(server.url) as client:
+
+        def denoise(source: Path, target: Path) -> int:
+            asked.append(source.name)
+            if len(asked) == 1:
+                folder.rename(away)  # as a share that is not to be reached
+                threading.Timer(0.2, lambda: away.rename(folder)).start()  # while it looks, some twenty times
+            return client.denoise(source, target, iterations=1).report.points
+
+        outcomes = watch_folder(folder, results, denoise)
+        of_file, of_folder, done = (next(outcomes) for _ in range(3))
+    assert (of_file[0].name, type(of_file[1])) == ("scan.npy", FileNotFoundError)
+    assert (of_folder[0], type(of_folder[1])) == (folder, FileNotFoundError)
+    assert (done[0].name, done[1]) == ("scan.npy", 400)
+
+
 def test_a_file_that_fails_is_tried_again_only_when_it_changes(folder: Path) -> None:
     asked: list[str] = []
 
