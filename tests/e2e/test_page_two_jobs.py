@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import urllib.request
 from pathlib import Path
 from typing import Any
 
+from tests.conftest import RunningServer
 from tests.waiting import wait_for
 
 HOLD_ONE = """() => {
@@ -68,3 +72,27 @@ def test_a_list_that_comes_late_takes_no_newer_ones_place(page: Any, scan: Path)
         route.fulfill(response=answer)
     page.wait_for_timeout(50)
     assert page.is_hidden("#jobs")
+
+
+def test_tabs_whose_jobs_wait_leave_connections_to_others_and_to_cancel(
+    page: Any, server: RunningServer, scan: Path
+) -> None:
+    """Over HTTP/1.1 a browser has six to a server, for all of its tabs."""
+    worker = server.worker_pid()
+    os.kill(worker, signal.SIGSTOP)
+    try:
+        url = f"{server.url}/jobs?iterations=1"
+        urllib.request.urlopen(urllib.request.Request(url, scan.read_bytes(), method="POST")).close()
+        wait_for(lambda: b'"queued"' not in urllib.request.urlopen(f"{server.url}/jobs").read())  # it has the worker
+        tabs = [page, *(page.context.new_page() for _ in range(3))]
+        for tab in tabs:
+            tab.goto(server.url)
+            tab.select_option("#iterations", "1")
+            tab.set_input_files("#file", scan)
+            tab.click("#submit")
+            tab.locator("#status", has_text="Waiting").wait_for()
+        tabs[-1].click("#cancel")
+        tabs[-1].locator("#note", has_text="The job was canceled.").wait_for()
+    finally:
+        os.kill(worker, signal.SIGCONT)
+    page.wait_for_selector("#report:not([hidden])")

@@ -39,7 +39,16 @@ export async function followJob(id, { before, hooks, signal }) {
 
   const ended = new AbortController();
   const either = AbortSignal.any([signal, ended.signal]);
-  const patches = watchPatches(id, { onHeader, onFrame, isOver: () => isOver }, either).catch(() => false);
+  // Not while the job waits: over HTTP/1.1 a browser has six connections to a server, for all of its tabs together.
+  let patches = null;
+  const beginPatches = () => {
+    patches ??= watchPatches(id, { onHeader, onFrame, isOver: () => isOver }, either).catch(() => false);
+    return patches;
+  };
+  const onEvent = (kind, data) => {
+    if (kind === "start") beginPatches();
+    hooks.onEvent(kind, data);
+  };
   const silence = async () => {
     for (let before = -1; before !== frames; ) {
       before = frames;
@@ -48,10 +57,10 @@ export async function followJob(id, { before, hooks, signal }) {
     return false;
   };
   try {
-    const job = await watchJob(id, hooks.onEvent, signal);
+    const job = await watchJob(id, onEvent, signal);
     isOver = true;
     if (job.state !== "succeeded") return job;
-    const isWhole = await Promise.race([patches, silence()]);
+    const isWhole = await Promise.race([beginPatches(), silence()]);
     ended.abort(); // what comes late would be put over the result
     if (!isWhole && !signal.aborted) cloud = (await fromResult(job, cloud, hooks, signal)) ?? cloud;
     clearTimeout(timer);
