@@ -16,6 +16,8 @@ __all__ = ["Calibration"]
 # d of noise that one pass takes most of: little, and what leaves more of thin bodies (1.5 to 2 %).
 _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
 _STUCK_WITH_MORE_NOISE = 0.7  # as `stuck`, of d between those two where no walls were seen
+# Nor are walls read where the noise is more than so many radii of a patch: of dense points a pass leaves as much.
+_STUCK_UP_TO_RADII = 0.07
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
 
@@ -91,7 +93,8 @@ class Calibration:
         due = max(1 + sum(start > limit for limit in self.starts), _PASSES_OF_SHOWN_WALLS if shown_walls else 1)
         little = thin_walls or start < _LITTLE_NOISE_DISTANCE
         stuck = self.stuck if little else max(self.stuck, _STUCK_WITH_MORE_NOISE)
-        if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
+        may_be_walls = little or noise_in_radii < _STUCK_UP_TO_RADII
+        if done == 1 < due and start < _ONE_PASS_DISTANCE and may_be_walls and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
         if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:

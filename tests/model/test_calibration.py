@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,13 @@ def test_a_second_pass_is_made_only_after_a_first_that_took_much(
 ) -> None:
     twice = Calibration(starts=(0.45,), polish=(), settled=())
     assert passes(twice, Trace("walls", 0.01, (start, now, 0.35, 0.35), (), thin_walls=thin_walls)) == made
+
+
+def test_a_first_pass_that_leaves_much_of_dense_points_has_met_no_walls() -> None:
+    distances = (0.84, 0.60, 0.21, 0.16)  # of `dino`, 50K points with 2 %, which ended with 2.4 times the CD
+    few, dense = Trace("plates", 0.01, distances, (), noise_in_radii=0.04), Trace("dino", 0.02, distances, ())
+    assert passes(Calibration(), few) == 1
+    assert passes(Calibration(), replace(dense, noise_in_radii=0.155)) > 1
 
 
 def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
