@@ -7,7 +7,7 @@ import os
 import stat
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 __all__ = ["check_target", "place_named", "replaced_when_complete"]
@@ -48,11 +48,13 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
     """Lend an empty file beside `path`, which takes its place if the block ends well, else it vanishes.
 
     It is on the disk before it does: what it replaces may be all that is left of a result. A file that is replaced
-    hands on its mode, and a symbolic link stays one: what it points to is replaced.
+    hands on its mode, and its owner and group where the system lets it; a symbolic link stays one: what it points to is
+    replaced.
     """
     check_target(path)
     target = _target(path)
-    mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
+    before = target.stat() if target.exists() else None
+    mode = None if before is None else stat.S_IMODE(before.st_mode)
     unfinished = _beside(target)
     # Nobody who may not read the result can read it while it is written; a read-only one has to be written, too.
     os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else mode | stat.S_IWUSR))
@@ -61,8 +63,9 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
             yield unfinished
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
-        if mode is not None:
-            unfinished.chmod(mode)
+        if before is not None and mode is not None:
+            _hand_over(unfinished, before)
+            unfinished.chmod(mode)  # after that: a new owner takes bits of it away
         unfinished.replace(target)
         _sync_folder(target.parent)
     finally:
@@ -71,6 +74,18 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
 
 def _beside(target: Path) -> Path:
     return target.with_name(f".{target.stem[:_NAME]}.{uuid.uuid4().hex[:12]}.part{target.suffix[:_NAME]}")
+
+
+def _hand_over(path: Path, before: os.stat_result) -> None:
+    """Give a file the owner and group of the one that it replaces: root's would lock its owner out of a private one."""
+    now = path.stat()
+    if os.name != "posix" or (now.st_uid, now.st_gid) == (before.st_uid, before.st_gid):
+        return
+    try:
+        os.chown(path, before.st_uid, before.st_gid)
+    except OSError:  # root alone may give a file away; to a group of one's own anybody may
+        with suppress(OSError):
+            os.chown(path, -1, before.st_gid)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from contextlib import suppress
@@ -29,6 +30,26 @@ def test_a_replaced_file_keeps_its_mode_and_is_never_open_to_more(kept: int, tmp
         assert mode(unfinished) == kept | stat.S_IWUSR
         unfinished.write_bytes(b"new")
     assert (path.read_bytes(), mode(path)) == (b"new", kept)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="root alone may give a file away")
+@pytest.mark.parametrize("may", [True, False])
+def test_a_replaced_file_stays_its_owners_where_the_system_lets_it(
+    may: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path := tmp_path / "a.ply").write_bytes(b"old")
+    path.chmod(0o600)
+    os.chown(path, 1234, 4321)
+    if not may:
+
+        def refuse(*_: object) -> None:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+        monkeypatch.setattr(os, "chown", refuse)
+    write(path, b"new")
+    now = path.stat()
+    assert (now.st_uid, now.st_gid) == ((1234, 4321) if may else (os.geteuid(), os.getegid()))
+    assert (path.read_bytes(), mode(path)) == (b"new", 0o600)
 
 
 def test_a_new_file_has_the_mode_of_any_new_file(tmp_path: Path) -> None:
