@@ -18,8 +18,8 @@ _AROUND = b'" \t\n\v\f\r'  # a cell between delimiters
 # Names of position columns as programs write them, ParaView's and surveyors' among them; a unit may follow: x [m].
 _POSITIONS = (
     AXES,
-    ("points:0", "points:1", "points:2"),
-    ("points_m_xyz:0", "points_m_xyz:1", "points_m_xyz:2"),  # VeloView's
+    *(tuple(f"points{mark}{axis}" for axis in range(3)) for mark in ":_"),  # of old and of new ParaView
+    *(tuple(f"points_m_xyz{mark}{axis}" for axis in range(3)) for mark in ":_"),  # VeloView's
     ("point_x", "point_y", "point_z"),  # ArcGIS's
     ("px", "py", "pz"),
     ("pos_x", "pos_y", "pos_z"),
