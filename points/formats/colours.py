@@ -15,7 +15,7 @@ RGB = ("red", "green", "blue")
 PACKED = ("rgb", "rgba")  # PCL's: the bytes of a 32 bit number, 0xAARRGGBB, often called a float
 _NO_COLOUR = np.uint32(0x7FC00000)  # NaN, which PCL has for points that are not there
 _TRIPLES = (RGB, ("r", "g", "b"))
-_ARRAYS = ("colors", "color", "colours", "colour")  # (N, 3), as Open3D has it and NumPy's archives hold it
+_ARRAYS = ("colors", "color", "colours", "colour", "rgb")  # (N, 3), as Open3D has it and NumPy's archives hold it
 _SAME = 1e-3  # of a step of 1/255: what float32 rounds a share to
 _Attributes = Mapping[str, npt.NDArray[Any]]
 

@@ -32,7 +32,7 @@ from straightpcf.points.formats.positions import moved, widened
 __all__ = ["KEYS", "MAX_MEMBERS", "MAX_UNPACKED_BYTES", "Npz"]
 
 KEYS = ("points", "xyz", "pos", "positions", "coord", "coords", "vertices")
-_NO_POSITIONS = ("normal", "color", "colour")  # how names of arrays begin that are (N, 3) as well
+_NO_POSITIONS = ("normal", "color", "colour", "rgb")  # how names of arrays begin that are (N, 3) as well
 MAX_MEMBERS = 1000
 MAX_UNPACKED_BYTES = 4 << 30
 # Of a point: what is beyond stays packed, as arrays that are no attributes do. So does what `most_unpacked` forbids.

@@ -35,6 +35,7 @@ SAID = {
     "PCL's rgb that are NaN": {"rgb": (WORDS | np.uint32(0xFF000000)).view("<f4")},
     "big-endian rgb": {"rgb": WORDS.view("<f4").astype(">f4")},
     "an array of bytes": {"Colors": BYTES},
+    "an array called rgb": {"rgb": BYTES},
     "an array of Open3D's shares": {"colors": BYTES / 255},
     "an array of torch's shares": {"color": (BYTES / 255).astype(np.float32)},
 }
@@ -126,7 +127,7 @@ def test_alpha_is_kept_where_it_says_something() -> None:
         three(-BYTES.astype(np.int32)),
         {"rgb": WORDS.astype(np.float64)},
         {"rgb": WORDS.view("<f4"), "red": BYTES[:, 0]},
-        {"rgb": BYTES},
+        {"rgb": BYTES[:, :2]},
         {"colors": np.random.default_rng(0).random((N, 3))},
         {"colors": BYTES - 0.5},
         {"colors": BYTES[:, :2]},

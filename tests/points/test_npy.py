@@ -111,6 +111,7 @@ def test_npz_positions_are_found_and_other_arrays_kept(key: str, tmp_path: Path)
     [
         {"points": np.float64(3)},
         {"points": np.arange(6), "xyz": np.zeros((6, 2))},
+        {"rgb": np.ones((6, 3), np.float32), "RGB": np.ones((6, 4))},
         {"normals": np.ones((6, 3)), "Normal": np.ones((6, 3)), "colors": np.ones((6, 3)), "colour": np.ones((6, 4))},
     ],
 )
