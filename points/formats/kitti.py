@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import HEAD_BYTES, Format, check_count
 from straightpcf.points.formats.positions import AXES, narrowed, put_positions, rounding, widened
+from straightpcf.points.formats.scalars import with_intensity
 
 __all__ = ["Kitti"]
 
@@ -62,8 +64,9 @@ class Kitti(Format):
 
     def left_behind(self, cloud: PointCloud) -> list[str]:
         """Name everything but positions and an intensity that a frame can have, float32 as in every frame."""
-        held = "intensity" if _has_intensity(cloud) else None
-        return [*cloud.beside, *(name for name in cloud.attributes if name != held)]
+        called = with_intensity(cloud.attributes)  # the same attributes, in the same order
+        held = "intensity" if _has_intensity(called) else None
+        return [*cloud.beside, *(was for was, name in zip(cloud.attributes, called, strict=True) if name != held)]
 
     def check(self, cloud: PointCloud) -> None:
         """Raise UnsupportedCloud where float32 does not hold the cloud."""
@@ -85,17 +88,17 @@ def _new_rows(cloud: PointCloud) -> npt.NDArray[np.float32]:
     table = np.zeros((len(cloud), 4), "<f4")
     table[:, :3] = narrowed(cloud.xyz, table.dtype, what="a position")
     _check_rounding(cloud.xyz, table[:, :3])
-    if _has_intensity(cloud):
+    if _has_intensity(attributes := with_intensity(cloud.attributes)):
         with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
-            wide = cloud.attributes["intensity"].astype(np.float64)
+            wide = attributes["intensity"].astype(np.float64)
         table[:, 3] = narrowed(wide, table.dtype, what="an intensity")
     return table
 
 
-def _has_intensity(cloud: PointCloud) -> bool:
-    values = cloud.attributes.get("intensity")
+def _has_intensity(attributes: Mapping[str, npt.NDArray[Any]]) -> bool:
+    values = attributes.get("intensity")
     is_column = values is not None and values.ndim == 1 and values.dtype.kind in "biuf"
-    return is_column and bool(_are_intensities(cloud.attributes["intensity"]).all())
+    return is_column and bool(_are_intensities(attributes["intensity"]).all())
 
 
 def _check_intensity(values: npt.NDArray[np.float32]) -> None:

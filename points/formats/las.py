@@ -22,7 +22,7 @@ from straightpcf.points.formats.las_layout import (
     is_geographic,
     read_header,
 )
-from straightpcf.points.formats.las_new import TAKEN, TYPES, check_new, new_las, renamed
+from straightpcf.points.formats.las_new import TAKEN, TYPES, as_dimensions, check_new, new_las, renamed
 from straightpcf.points.formats.laz_codec import check_packing, pack, packing_record, unpack
 from straightpcf.points.formats.positions import AXES, moved
 from straightpcf.points.formats.scalars import not_held
@@ -83,7 +83,8 @@ class Las(Format):
         """Name nothing of a file that is only packed or unpacked."""
         if isinstance(cloud.source, LasSource):
             return []
-        return [*cloud.beside, *not_held(cloud.attributes, self.types, taken=TAKEN), *renamed(cloud)]
+        attributes = as_dimensions(cloud.attributes)
+        return [*cloud.beside, *not_held(attributes, self.types, taken=TAKEN), *renamed(cloud)]
 
     def check(self, cloud: PointCloud) -> None:
         """Raise UnsupportedCloud where no file can be written; LAZ wants its library, too, and a known layout."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,14 @@ from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.colours import RGB, in_16_bits
 from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
 from straightpcf.points.formats.positions import from_middle, rounding
-from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.scalars import meant, scalar_columns
 
-__all__ = ["TAKEN", "TYPES", "check_new", "new_las", "renamed"]
+__all__ = ["TAKEN", "TYPES", "as_dimensions", "check_new", "new_las", "renamed"]
 
 FINEST_USUAL_SCALE = 1e-4
 _MOST_LOST = 1e-4  # of the extent of most points, by rounding to a step of the scale
 MAX_EXTRA_DIMENSIONS = 300
+_MOST_DIMENSIONS = 3  # the point format that is written at most: with times and colours
 _HEADER_BYTES = 227
 TAKEN = ("x", "y", "z", "X", "Y", "Z")  # laspy calls positions and their integers so
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
@@ -40,6 +41,17 @@ def renamed(cloud: PointCloud) -> list[str]:
     *_, labels = _laid_out(cloud)
     short = [name.decode("utf-8", "replace") for name in _short_names(labels)]
     return [f"{was} (renamed to {now})" for was, now in zip(labels.values(), short, strict=True) if was != now]
+
+
+def as_dimensions(attributes: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return attributes with those that a standard dimension holds called as it is; a colour as it was."""
+    known = {name: where for name, where in standard_dimensions(_MOST_DIMENSIONS).items() if name not in RGB}
+    called = {}
+    for name, was in meant(attributes, known).items():
+        values = attributes[was]
+        if values.ndim == 1 and values.dtype.kind in "biuf" and _fits(values, known[name]):
+            called[was] = name
+    return {called.get(name, name): values for name, values in attributes.items()}
 
 
 def new_las(cloud: PointCloud) -> bytes:
@@ -73,7 +85,7 @@ def _laid_out(
 
     The last by the names that they have now.
     """
-    columns = scalar_columns(in_16_bits(cloud.attributes), TYPES, taken=TAKEN)
+    columns = scalar_columns(in_16_bits(as_dimensions(cloud.attributes)), TYPES, taken=TAKEN)
     has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
     has_time = "gps_time" in columns and _is_double(columns["gps_time"])
     point_format = 2 * has_rgb + has_time

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from straightpcf.points.formats.positions import AXES
 
-__all__ = ["further_columns", "not_held", "scalar_columns"]
+__all__ = ["further_columns", "meant", "not_held", "scalar_columns", "with_intensity"]
 
 _NAME_CHARACTERS = 64
 _WIDER = {"f2": "f4", "b1": "u1", "i8": "f8", "u8": "f8", "f16": "f8"}
@@ -63,6 +63,29 @@ def not_held(
         if changes:
             lost.append(f"{name} ({', '.join(changes)})")
     return lost
+
+
+def meant(names: Collection[str], known: Collection[str]) -> dict[str, str]:
+    """Return, of the `known` names that are not among `names`, which of these each is: the only one that is alike.
+
+    Programs write Intensity, ReturnNumber, GPS Time and scalar_Intensity for what LAS calls intensity and so on.
+    """
+    alike: dict[str, list[str]] = {}
+    for name in names:
+        alike.setdefault(_bare(name), []).append(name)
+    found = {name: alike.get(_bare(name), []) for name in known if name not in names}
+    return {name: several[0] for name, several in found.items() if len(several) == 1}
+
+
+def with_intensity(attributes: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return attributes with the one that is the intensity called so."""
+    was = meant(attributes, ("intensity",)).get("intensity")
+    return {"intensity" if name == was else name: values for name, values in attributes.items()}
+
+
+def _bare(name: str) -> str:
+    """Return a name without case, marks and what CloudCompare puts before those of a PLY file."""
+    return re.sub(r"[\s_-]", "", name.lower().removeprefix("scalar_"))
 
 
 def _held_as(kind: str, types: Collection[str]) -> str:

@@ -16,7 +16,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import RGB, in_8_bits, unpacked
 from straightpcf.points.formats.positions import AXES
-from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.scalars import scalar_columns, with_intensity
 from straightpcf.points.formats.text import (
     Lines,
     as_integers,
@@ -158,7 +158,7 @@ class Pts(Xyz):
         source = cloud.source
         if isinstance(source, XyzSource) and self._has_layout(source.layout):
             return []
-        held = in_8_bits(cloud.attributes)
+        held = in_8_bits(with_intensity(cloud.attributes))
         columns = _pts_columns(held)
         there = [name for name in columns if name in held]
         other = [name for name in there if not np.array_equal(held[name], columns[name], equal_nan=True)]
@@ -167,7 +167,7 @@ class Pts(Xyz):
 
     def _new_file(self, cloud: PointCloud) -> bytes:
         """Lay out what the format has columns for; with a colour, intensity is there."""
-        return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(cloud.attributes)), " ")
+        return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(with_intensity(cloud.attributes))), " ")
 
 
 def _table(

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyPoints, UnknownFormat, UnsupportedCloud
-from straightpcf.points.formats import read_cloud, write_cloud
+from straightpcf.points.formats import format_named, read_cloud, write_cloud
 from tests.clouds import torus
 
 N = 40
@@ -39,6 +40,20 @@ def test_rows_that_did_not_move_keep_their_bits(frame: Path) -> None:
     np.testing.assert_array_equal(after[still], before[still])
     np.testing.assert_array_equal(after[:, 3], before[:, 3])
     np.testing.assert_array_equal(after.view("<f4")[::10, :3], xyz[::10].astype("<f4"))
+
+
+@pytest.mark.parametrize("name", ["Intensity", "scalar_Intensity"])
+def test_intensity_as_other_programs_call_it_is_there(name: str, tmp_path: Path) -> None:
+    """CloudCompare's, PDAL's."""
+    values = np.arange(float(N))
+    cloud = PointCloud(torus(N), {"ring": values, name: values})
+    for called in ("kitti", "pts"):
+        format = format_named(called)
+        assert format.left_behind(cloud) == ["ring"]
+        write_cloud(cloud, out := tmp_path / f"out{format.suffixes[0]}", format)
+        np.testing.assert_array_equal(read_cloud(out)[0].attributes["intensity"], values)
+        refused = replace(cloud, attributes={name: -values})
+        assert format.left_behind(refused) == ([name] if called == "kitti" else [])
 
 
 @pytest.mark.parametrize("over", [1, 4, 15])

@@ -338,6 +338,36 @@ def test_attributes_with_names_of_dimensions_are_put_there_or_beside_them(suffix
     assert not any(np.any(theirs[name]) for name in ("user_data", "key_point", "synthetic"))
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        ("Intensity", "ReturnNumber", "NumberOfReturns", "Classification", "GpsTime", "PointSourceId"),  # PDAL's CSV
+        ("scalar_Intensity", "scalar_Return_Number", "scalar_Number_Of_Returns", "scalar_Classification",
+         "scalar_Gps_Time", "scalar_Point_Source_ID"),  # CloudCompare's PLY
+        ("INTENSITY", "return number", "number-of-returns", "CLASSIFICATION", "GPS Time", "point source id"),
+    ],
+)  # fmt: skip
+def test_dimensions_as_other_programs_call_them_are_put_there(said: tuple[str, ...], tmp_path: Path) -> None:
+    names = ("intensity", "return_number", "number_of_returns", "classification", "gps_time", "point_source_id")
+    values = np.arange(N) % 5 + 1.0
+    cloud = PointCloud(torus(N), {name: values + place for place, name in enumerate(said)})
+    assert format_named("las").left_behind(cloud) == []
+    write_cloud(cloud, out := tmp_path / "out.las", format_named("las"))
+    theirs = laspy.read(out)
+    assert list(theirs.point_format.extra_dimension_names) == []
+    for place, name in enumerate(names):
+        np.testing.assert_array_equal(theirs[name], values + place)
+
+
+def test_a_dimension_of_two_names_or_numbers_that_do_not_fit_is_beside_it(tmp_path: Path) -> None:
+    share = np.linspace(0, 1, N)
+    attributes = {"Intensity": share, "GpsTime": share, "GPSTIME": share, "User Data": share + 256}
+    write_cloud(PointCloud(torus(N), attributes), out := tmp_path / "out.las", format_named("las"))
+    theirs = laspy.read(out)
+    assert list(theirs.point_format.extra_dimension_names) == ["Intensity", "GpsTime", "GPSTIME", "User_Data"]
+    np.testing.assert_array_equal(theirs["Intensity"], share)
+
+
 def test_intensity_that_is_no_whole_number_stays_what_it_is(tmp_path: Path) -> None:
     """A KITTI frame's is in 0..1, and a table may hold `extra_intensity`, too."""
     attributes = {"intensity": np.linspace(0, 1, N, dtype=np.float32), "extra_intensity": np.arange(N)}
