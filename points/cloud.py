@@ -13,8 +13,11 @@ from straightpcf.points.errors import InvalidCloud
 
 __all__ = ["NORMALS", "PointCloud", "as_positions"]
 
-# What files call them: PLY, PCD, PDAL.
-NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("NormalX", "NormalY", "NormalZ"))
+# What files call them: PLY, PCD, PDAL; CloudCompare's text, and others'.
+NORMALS = (
+    *(("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("NormalX", "NormalY", "NormalZ")),
+    *(("Nx", "Ny", "Nz"), ("NX", "NY", "NZ")),
+)
 _NORMAL_ARRAYS = ("normals", "normal")  # (N, 3), in NumPy's archives
 
 

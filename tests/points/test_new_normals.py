@@ -108,6 +108,15 @@ def test_a_new_file_calls_normals_as_its_readers_do(
     assert [*read_cloud(out)[0].attributes] == [*NORMALS[0], *NORMALS[1]]
 
 
+def test_normals_in_a_text_of_cloudcompare_are_some(tmp_path: Path) -> None:
+    rows = ["//X Y Z Nx Ny Nz", str(N), *(" ".join(map(repr, row)) for row in np.hstack([XYZ, OLD]).tolist())]
+    (source := tmp_path / "cloud.txt").write_text("\n".join(rows))
+    cloud, _ = read_cloud(source)
+    write_cloud(cloud.with_normals(NEW), out := tmp_path / "new.ply", format_named("ply"))
+    assert read_cloud(out)[0].normal_names == ("nx", "ny", "nz")
+    np.testing.assert_array_equal(read_cloud(out)[0].old_normals(), NEW)
+
+
 def test_an_array_of_normals_becomes_columns(tmp_path: Path) -> None:
     np.savez(source := tmp_path / "cloud.npz", points=XYZ, normals=OLD, colors=np.full((N, 3), 255, np.uint8))
     cloud, _ = read_cloud(source)
