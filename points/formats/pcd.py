@@ -17,12 +17,13 @@ from straightpcf.points.formats.base import Format, check_count, check_room, che
 from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
-from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.scalars import scalar_columns, with_intensity
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
 __all__ = ["Pcd"]
 
 _MOST_LOST = 1e-6  # of a new file's extent, by float positions; those of an object or a frame lose 1e-7
+_FLOATS = frozenset(("intensity", "curvature", *NORMALS[1]))  # of PCL's point types: until 1.15 it reads no other there
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 
 
@@ -226,11 +227,25 @@ def _position_type(xyz: npt.NDArray[np.float64]) -> str:
     return "<f4" if is_held and lost / 2 <= _MOST_LOST * half else "<f8"
 
 
+def _float(name: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return (N,) numbers as float32 where that says the same, of a normal where it has a place for them at all."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        stored = values.astype("<f4")
+        again = stored.astype(values.dtype)
+    if name in NORMALS[1]:
+        return stored if np.array_equal(np.isfinite(stored), np.isfinite(values)) else values
+    others = moved(again, values)
+    # Of a text, 0.4 is the float32 that is written so.
+    is_said = not others.any() or np.array_equal(stored[others].astype(str).astype(np.float64), values[others])
+    return stored if is_said else values
+
+
 def _new_file(cloud: PointCloud) -> bytes:
     """Write a binary file with positions and every attribute as fields of one value."""
     kind = _position_type(cloud.xyz)
     columns = {axis: cloud.xyz[:, column].astype(kind) for column, axis in enumerate(AXES)}
-    columns |= scalar_columns(packed(cloud.new_attributes(NORMALS[1])), _TYPES, taken=AXES)
+    further = scalar_columns(packed(with_intensity(cloud.new_attributes(NORMALS[1]))), _TYPES, taken=AXES)
+    columns |= {name: _float(name, values) if name in _FLOATS else values for name, values in further.items()}
     table = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values

@@ -6,8 +6,10 @@ import struct
 import time
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from straightpcf.points.cloud import PointCloud
@@ -259,3 +261,36 @@ def test_five_megabytes_of_lzf_take_seconds_at_worst() -> None:
     short_matches = b"\x00a" + b"\x20\x00" * 800_000
     assert lzf.decompress(short_matches, 2_400_001) == b"a" * 2_400_001
     assert time.monotonic() - began < 10
+
+
+@pytest.mark.parametrize(
+    ("values", "is_float"),
+    [
+        (np.arange(50, dtype=np.uint16) * 1300, True),  # LAS
+        (np.arange(50) / 10, True),  # a text's
+        (np.where(np.arange(50) % 5, 0.25, np.nan), True),
+        (np.arange(50) / 3, False),
+        (np.arange(50) + 2**60, False),
+        (np.full(50, 1e300), False),
+    ],
+)
+def test_a_new_file_has_an_intensity_that_pcl_reads_where_that_loses_nothing(
+    values: npt.NDArray[Any], is_float: bool, tmp_path: Path
+) -> None:
+    """PointXYZI takes a float alone: of any other type there was 0."""
+    cloud = PointCloud(torus(50), {"Intensity": values, "ring": values})
+    write_cloud(cloud, out := tmp_path / "out.pcd", format_named("pcd"))
+    found = read_cloud(out)[0].attributes
+    assert [*found] == ["intensity", "ring"]
+    assert found["intensity"].dtype == (np.float32 if is_float else values.dtype)
+    np.testing.assert_allclose(found["intensity"], values, rtol=1e-7 * is_float)
+    np.testing.assert_array_equal(found["ring"], values)
+
+
+def test_a_new_file_has_normals_that_pcl_reads(tmp_path: Path) -> None:
+    normals = torus(50) / 3
+    cloud = PointCloud(torus(50), dict(zip(("Nx", "Ny", "Nz"), normals.T, strict=True)))
+    write_cloud(cloud, out := tmp_path / "out.pcd", format_named("pcd"))
+    found = read_cloud(out)[0]
+    assert {found.attributes[name].dtype for name in ("normal_x", "normal_y", "normal_z")} == {np.dtype(np.float32)}
+    np.testing.assert_allclose(found.old_normals(), normals, atol=1e-7)
