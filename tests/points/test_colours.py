@@ -30,6 +30,7 @@ SAID = {
     "LAS, high bytes only": three(BYTES.astype(np.uint16) << 8),
     "LAS, low bytes only": three(BYTES.astype(np.uint16)),
     "text": three(BYTES.astype(np.float64), ("R", "G", "B")),
+    "OpenSfM's": three(BYTES, ("diffuse_red", "diffuse_green", "diffuse_blue")),
     "PCL's rgb": {"rgb": WORDS.view("<f4")},
     "PCL's rgba": {"rgba": WORDS | np.uint32(0xFF000000)},
     "PCL's rgb that are NaN": {"rgb": (WORDS | np.uint32(0xFF000000)).view("<f4")},
