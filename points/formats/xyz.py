@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import PointCloud
+from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import RGB, in_8_bits, unpacked
@@ -33,6 +33,7 @@ __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Tsv", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
 _COUNTED = 10  # points: of fewer, an x may go up by one each
+_UNIT_ERROR = 1e-2  # of a normal's length, by the digits of a text
 _LOOKED_AT = 1 << 14  # bytes of the first rows, which tell decimal commas from cells
 # Three numbers or more, each of two cells between commas: 0,5, 1,5, 2,5.
 _PAIRS = re.compile(rb"\s*[+-]?\d+,\d+(?:,\s*[+-]?\d+,\d+){2,}\s*")
@@ -95,7 +96,8 @@ class Xyz(Format):
             if len(starts) and all(raw[starts[0, axis] : ends[0, axis]].isdigit() for axis in (0, 1)):
                 _refuse_numbered(columns, layout.line)
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
-        attributes = {layout.names[column]: values for column, values in columns.items()}
+        names = (*AXES, *NORMALS[0]) if _are_with_normals(layout, columns) else layout.names
+        attributes = {names[column]: values for column, values in columns.items()}
         source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
         return PointCloud(xyz, attributes, source, beside=tuple(layout.names[column] for column in texts))
 
@@ -216,6 +218,20 @@ def _table(
     there = {*layout.axes} | ({*parts} - unsaid)
     columns = {column: _joined(values) for column, values in parts.items() if column in there}
     return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
+
+
+def _are_with_normals(layout: Layout, columns: Mapping[int, npt.NDArray[Any]]) -> bool:
+    """Say whether six columns without names are x y z nx ny nz, as in files of MeshLab and CGAL, and in `.xyzn`.
+
+    Told by their length, of those that are not 0, and by a number below 0: colours of 0 to 1 have none.
+    """
+    if layout.names != tuple(f"column_{column + 1}" for column in range(6)) or not {3, 4, 5} <= columns.keys():
+        return False
+    normals = np.stack([columns[axis].astype(np.float64) for axis in (3, 4, 5)], axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.sqrt((normals**2).sum(axis=1))
+    lengths = lengths[~(lengths == 0)]
+    return len(lengths) > 0 and bool((np.abs(lengths - 1) < _UNIT_ERROR).all() and (normals < 0).any())
 
 
 def _has_decimal_comma(text: bytes, delimiter: bytes | None) -> bool:

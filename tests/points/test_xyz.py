@@ -282,6 +282,32 @@ def test_text_is_never_guessed_from_its_content(tmp_path: Path) -> None:
     assert len(read(tmp_path, b"1 2 3\n4 5 6\n", "body", name="Scan.TXT")) == 2
 
 
+@pytest.mark.parametrize(
+    ("vectors", "are_normals"),
+    [
+        ("-1 0 0\n0 0.6 0.8\n0 0 0", True),
+        ("-0.577 0.577 0.577\n0 0 1\n0.6 0.8 0", True),
+        ("1 0 0\n0 1 0\n0 0 1", False),  # pure colours
+        ("-1 0 0\n0 0.5 0.8\n0 0 1", False),
+        ("-1 0 0\n0 nan 1\n0 0 1", False),
+        ("255 0 0\n0 0 255\n0 0 0", False),
+        ("0 0 0\n0 0 0\n0 0 0", False),
+        ("-1 0 a\n0 0 b\n0 0 c", False),
+        ("-1 0 0 1\n0 1 0 1\n0 0 1 1", False),
+    ],
+)
+def test_unit_vectors_behind_positions_are_normals(vectors: str, are_normals: bool, tmp_path: Path) -> None:
+    """MeshLab, CGAL and Open3D (.xyzn) write them so, without names."""
+    rows = [f"{row}.5 {row} 2 {vector}" for row, vector in enumerate(vectors.split("\n"))]
+    raw = "\n".join(rows).encode()
+    cloud = read(tmp_path, raw)
+    assert cloud.normal_names == (("nx", "ny", "nz") if are_normals else ())
+    assert written(tmp_path, cloud) == raw
+    if are_normals:
+        write_cloud(cloud, out := tmp_path / "out.ply", format_for("out.ply"))
+        np.testing.assert_array_equal(read_cloud(out)[0].old_normals(), cloud.old_normals())
+
+
 @pytest.mark.parametrize("name", ["a.xyzn", "a.xyzrgb", "a.TSV"])
 def test_tables_of_other_names_are_read_as_tables(name: str, tmp_path: Path) -> None:
     raw = b"1\t2\t3\t7\n4\t5\t6\t8\n"
