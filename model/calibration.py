@@ -15,9 +15,9 @@ __all__ = ["Calibration"]
 
 # d of noise that one pass takes most of: little, and what leaves more of thin bodies (1.5 to 2 %).
 _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
-_STUCK_WITH_MORE_NOISE = 0.7  # as `stuck`, of d between those two where no walls were seen
-# Nor are walls read where the noise is more than so many radii of a patch: of dense points a pass leaves as much.
-_STUCK_UP_TO_RADII = 0.07
+# As `stuck`, of d between those two where no walls were seen; more by so much for each radius of a patch that the noise
+# is above so many: of dense points a pass leaves more, and walls that are read as noise are read as little in radii.
+_STUCK_WITH_MORE_NOISE, _STUCK_BY_RADIUS, _STUCK_FROM_RADII = 0.7, 8.0, 0.03
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
 
@@ -92,9 +92,11 @@ class Calibration:
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = max(1 + sum(start > limit for limit in self.starts), _PASSES_OF_SHOWN_WALLS if shown_walls else 1)
         little = thin_walls or start < _LITTLE_NOISE_DISTANCE
-        stuck = self.stuck if little else max(self.stuck, _STUCK_WITH_MORE_NOISE)
-        may_be_walls = little or noise_in_radii < _STUCK_UP_TO_RADII
-        if done == 1 < due and start < _ONE_PASS_DISTANCE and may_be_walls and now > stuck * start:
+        stuck = self.stuck
+        if not little:
+            more = _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _STUCK_FROM_RADII)
+            stuck = max(stuck, _STUCK_WITH_MORE_NOISE + more)
+        if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
         if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:
