@@ -19,20 +19,20 @@ from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_table", "passes", "trace"]
 
-# What `calibrate` chooses from: every combination. A second limit of polish of 0.58 gives every other cloud with 1 % a
-# third pass for 0.03 % less CD, a third one of 0.79 or 0.83 most of those with 2 % a fourth for 0.1 %.
+# What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
-    "starts": tuple(product((0.45, 0.50, 0.55, 0.73), (0.815, 0.85, 0.88, 0.905), (0.945,))),
-    "polish": tuple(product((0.22, 0.26, 0.3), (0.62, 0.66), (0.86, 0.87), (0.88, 0.9, 0.92))),
+    "starts": tuple(product((0.45, 0.50, 0.73), (0.75, 0.78, 0.815, 0.85), (0.9, 0.945))),
+    "polish": tuple(product((0.22, 0.26), (0.62,), (0.74, 0.78, 0.82, 0.86), (0.9, 0.92))),
     # Before the second and third pass, before the fourth and fifth.
     "settled": tuple(
-        (few, few, many, many) for few, many in product((0.14, 0.16, 0.18, 0.2, 0.22), (0.18, 0.2, 0.22, 0.25))
+        (few, few, many, many) for few, many in product((0.14, 0.18, 0.2, 0.22, 0.26, 0.3), (0.18, 0.2, 0.22, 0.26))
     ),
     "crowded": (0.042, 1.0),
     "stuck": (0.61,),
     "stirred": (0.5,),
     "most": (5,),
 }
+_WORTH = 0.01  # of CD is what one more pass has to gain on the mean, for it takes as long as those before
 # Levels at which d is read for the table; above, d hardly rises.
 _TABLE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.04, 0.05)
@@ -100,13 +100,13 @@ def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], 
 
 
 def calibrate(traces: Sequence[Trace], table: Calibration | None = None) -> Calibration:
-    """Choose the limits of `auto` by replaying recorded traces; of equally good ones, those of fewest passes.
+    """Choose the limits of `auto` by replaying recorded traces: by `loss`, and what further passes are worth.
 
     table: whose table of noise levels to keep; without one it is read off the traces.
     """
     known = table or _with_table([(t.noise_std, t.distances[0]) for t in traces if t.noise_type == "gaussian"])
     choices = [replace(known, **dict(zip(_LIMITS, limits, strict=True))) for limits in product(*_LIMITS.values())]
-    return min(choices, key=lambda choice: (loss(choice, traces), sum(passes(choice, t) for t in traces)))
+    return min(choices, key=lambda choice: loss(choice, traces, worth=_WORTH))
 
 
 def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
@@ -116,20 +116,21 @@ def _with_table(readings: Sequence[tuple[float, float]]) -> Calibration:
     return Calibration(distances=tuple(d for d, _ in table), noise=tuple(s for _, s in table))
 
 
-def loss(calibration: Calibration, traces: Sequence[Trace]) -> float:
+def loss(calibration: Calibration, traces: Sequence[Trace], *, worth: float = 0.0) -> float:
     """Rate `auto` on recorded traces: the mean log ratio of its CD to that of each cloud's best number of passes.
 
     Every level (`Trace.level`) weighs the same. A cloud that is worse than its input weighs its log ratio to it ten
-    times more. Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5.
+    times more. Clean clouds, whose best is no pass at all, count by their CD in units of 1e-5. Each pass adds `worth`.
     """
     by_level: dict[tuple[str, str, float], list[float]] = {}
     for t in traces:
-        reached = t.chamfer[passes(calibration, t)]
+        made = passes(calibration, t)
+        reached = t.chamfer[made]
         if t.chamfer[0] > 0:
             rating = math.log(reached / min(t.chamfer[1:])) + 10 * max(0.0, math.log(reached / t.chamfer[0]))
         else:
             rating = reached / 1e-5
-        by_level.setdefault(t.level, []).append(rating)
+        by_level.setdefault(t.level, []).append(rating + worth * made)
     return float(np.mean([np.mean(ratings) for ratings in by_level.values()]))
 
 
