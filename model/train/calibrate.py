@@ -32,7 +32,7 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
     "stirred": (0.5,),
     "most": (5,),
 }
-_WORTH = 0.01  # of CD is what one more pass has to gain on the mean, for it takes as long as those before
+_WORTH = 0.005  # of CD is what one more pass has to gain on the mean, for it takes as long as those before
 # Levels at which d is read for the table; above, d hardly rises.
 _TABLE_LEVELS = (0.0, 0.0025, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03)
 NOISE_LEVELS = (0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.04, 0.05)
