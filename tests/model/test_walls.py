@@ -157,12 +157,13 @@ def pipe(count: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [1000, 1500])
 def test_walls_that_bend_stay_apart_too(count: int) -> None:
-    rough = noisy(pipe(count), 0.0025)
-    result = load_filter(threads=2).denoise(rough)
-    rings = np.hypot(result.xyz[:, 0], result.xyz[:, 1])
-    off = np.minimum(np.abs(rings - 0.4), np.abs(rings - 0.5))
-    assert np.sqrt(np.square(off).mean()) < 1.1 * 0.0025
-    assert any("walls closer together" in warning for warning in result.warnings)
+    model, squares = load_filter(threads=2), []
+    for seed in range(3):  # one cloud of so few points says little
+        result = model.denoise(noisy(pipe(count, seed), 0.0025))
+        rings = np.hypot(result.xyz[:, 0], result.xyz[:, 1])
+        squares.append(np.square(np.minimum(np.abs(rings - 0.4), np.abs(rings - 0.5))).mean())
+        assert any("walls closer together" in warning for warning in result.warnings)
+    assert np.sqrt(np.mean(squares)) < 1.1 * 0.0025
 
 
 def test_noise_within_bent_walls_is_taken_away_where_points_are_many() -> None:
