@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,9 @@ _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
 # As `stuck`, of d between those two where no walls were seen; more by so much for each radius of a patch that the noise
 # is above so many: of dense points a pass leaves more, and walls that are read as noise are read as little in radii.
 _STUCK_WITH_MORE_NOISE, _STUCK_BY_RADIUS, _STUCK_FROM_RADII = 0.7, 8.0, 0.03
+# What scenes have instead of the fitted limits, which are of objects: as they were before, when scans were looked at.
+_SCENE_STARTS = (0.45, 0.815, 0.945)
+_SCENE_POLISH, _SCENE_SETTLED = (0.22, 0.62, 0.86, 0.92), (0.18, 0.18, 0.22, 0.22)
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
 
@@ -74,6 +77,10 @@ class Calibration:
     def noise_std(self, distances: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Translate d into a noise std in the frame the network sees."""
         return np.interp(distances, self.distances, self.noise)
+
+    def of_scenes(self) -> Calibration:
+        """Return the calibration that scenes have: their further passes thin poles and wires, and d does not tell."""
+        return replace(self, starts=_SCENE_STARTS, polish=_SCENE_POLISH, settled=_SCENE_SETTLED)
 
     def passes_left(
         self,

@@ -211,8 +211,8 @@ class Run:
             return planned - self.iterations
         if len(self.points.xyz) < _FEW_POINTS:
             return 1 - self.iterations
-        first = self.readings[0]
-        return self.filter.calibration.passes_left(
+        first, calibration = self.readings[0], self.filter.calibration
+        return (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
             thin_walls=first.sampling.thin_walls,

@@ -23,9 +23,10 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_ta
 _LIMITS: dict[str, tuple[Any, ...]] = {
     "starts": tuple(product((0.45, 0.50, 0.73), (0.75, 0.78, 0.815, 0.85), (0.9, 0.945))),
     "polish": tuple(product((0.22, 0.26), (0.62,), (0.74, 0.78, 0.82, 0.86), (0.9, 0.92))),
-    # Before the second and third pass, before the fourth and fifth.
+    # Before the second pass, the third, the fourth and fifth.
     "settled": tuple(
-        (few, few, many, many) for few, many in product((0.14, 0.18, 0.2, 0.22, 0.26, 0.3), (0.18, 0.2, 0.22, 0.26))
+        (little, few, many, many)
+        for little, few, many in product((0.18, 0.14), (0.18, 0.2, 0.22, 0.26, 0.3), (0.18, 0.2, 0.22, 0.26))
     ),
     "crowded": (0.042, 1.0),
     "stuck": (0.61,),

@@ -92,6 +92,14 @@ def test_what_a_first_pass_leaves_of_large_noise_is_no_sign_of_walls(
     assert (passes(Calibration(), recorded) > 1) == goes_on
 
 
+def test_scenes_get_no_more_passes_than_their_own_limits_ask_for() -> None:
+    fitted = Calibration(starts=(0.45, 0.75, 0.9), polish=(0.22, 0.62, 0.74, 0.92), settled=(0.18, 0.26, 0.2, 0.2))
+    street = trace(0.0, 0.778, 0.30, 0.21, 0.15, 0.13, 0.12)
+    assert passes(fitted, street) == 4
+    assert passes(fitted.of_scenes(), street) == 2
+    assert fitted.of_scenes().noise == fitted.noise
+
+
 def test_what_the_first_pass_does_not_lower_is_no_noise() -> None:
     assert passes(Calibration(starts=(0.45,)), trace(0.0, 0.57, 0.48, 0.45, 0.44)) == 1
     nearly_clean = Calibration(starts=(0.45,), polish=(0.22,), settled=(0.18,))  # d of clean clouds is 0.12
