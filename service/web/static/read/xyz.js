@@ -6,7 +6,9 @@ export const MARKS = [";", ","]; // what may stand between cells where it is not
 const POSITIONS = [
   ["x", "y", "z"],
   ["points:0", "points:1", "points:2"],
+  ["points_0", "points_1", "points_2"],
   ["points_m_xyz:0", "points_m_xyz:1", "points_m_xyz:2"],
+  ["points_m_xyz_0", "points_m_xyz_1", "points_m_xyz_2"],
   ["point_x", "point_y", "point_z"],
   ["px", "py", "pz"],
   ["pos_x", "pos_y", "pos_z"],
