@@ -54,18 +54,18 @@ def replaced_when_complete(path: Path) -> Iterator[Path]:
     check_target(path)
     target = _target(path)
     before = target.stat() if target.exists() else None
-    mode = None if before is None else stat.S_IMODE(before.st_mode)
+    mode = 0o666 if before is None else stat.S_IMODE(before.st_mode) | stat.S_IWUSR
     unfinished = _beside(target)
     # Nobody who may not read the result can read it while it is written; a read-only one has to be written, too.
-    os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else mode | stat.S_IWUSR))
+    os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
     try:
         with place_named(path):
             yield unfinished
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
-        if before is not None and mode is not None:
+        if before is not None:
             _hand_over(unfinished, before)
-            unfinished.chmod(mode)  # after that: a new owner takes bits of it away
+            unfinished.chmod(stat.S_IMODE(before.st_mode))  # after that: a new owner takes bits of it away
         unfinished.replace(target)
         _sync_folder(target.parent)
     finally:
