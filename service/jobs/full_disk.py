@@ -26,7 +26,7 @@ DISK_TROUBLES = (OSError, sqlite3.Error, SpoolFull)
 RESERVE = "reserve"
 RESERVE_BYTES = 2**18  # SQLite takes 32 KiB to open a file, and some 10 pages to end or delete a job
 
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})  # the last: of no file that size (LimitFSIZE, FAT)
 _SQLITE_FULL = frozenset({sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE})  # the latter where it opens a file
 
 

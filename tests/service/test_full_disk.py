@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import time
@@ -169,3 +170,17 @@ def test_a_worker_whose_files_find_no_room_says_so(tmp_path: Path) -> None:
     ours, theirs = Pipe()
     with ours, theirs:
         assert _answer(load_filter(device="cpu"), job, theirs) == Failed("1", "spool_full", "the server's disk is full")
+
+
+def test_a_file_that_the_system_lets_grow_no_further_finds_no_room_either(shared_server: RunningServer) -> None:
+    """As under systemd's LimitFSIZE or `ulimit -f`; a disk's own limit (FAT) is the same error."""
+    pid = shared_server.process.pid
+    soft, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (2**22, hard))
+    try:
+        url = f"{shared_server.url}/denoise?filename=a.xyz"
+        answer = httpx2.post(url, content=b"1 2 3\n" * (2**20), timeout=60)
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
+    assert (answer.status_code, answer.json()["code"]) == (507, "spool_full")
+    assert not shared_server.spooled_files()
