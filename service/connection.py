@@ -14,6 +14,7 @@ from typing import Any
 import h11
 from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
 
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.service.api.errors import OUT_OF_DESCRIPTORS, problem_response
@@ -87,6 +88,7 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
                 return
             if _TWO_LENGTHS.issubset(name for name, _ in self.headers):
                 self.headers.append(_CLOSE)
+            self.cycle.default_headers = _AsOfNow(self.server_state)  # type: ignore[assignment]
             self.cycle.transport = _Answering(self.transport, close=self._close_behind)  # type: ignore[assignment]
 
         def _close_behind(self) -> None:
@@ -119,6 +121,16 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
                 self.timeout_keep_alive_task = self.loop.call_later(settings.upload_idle_seconds, self.transport.close)
 
     return Connection
+
+
+class _AsOfNow:
+    """The headers of every answer, when it begins: uvicorn takes its Date when the request came, minutes before."""
+
+    def __init__(self, state: ServerState) -> None:
+        self._state = state
+
+    def __add__(self, own: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+        return self._state.default_headers + own
 
 
 class _Answering:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import time
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 import pytest
@@ -135,6 +137,23 @@ def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> 
             writer.write(asked)
             answer = await asyncio.wait_for(reader.read(), timeout=20)
             assert (first + answer).count(b"HTTP/1.1 20") == 2
+            writer.close()
+
+    play(scenario)
+
+
+def test_an_answer_has_the_date_at_which_it_begins_and_not_that_of_its_request(tmp_path: Path) -> None:
+    """RFC 9110, 6.6.1: by it clients set their clocks, and no Last-Modified may be later."""
+
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(POST.replace(b"\r\n", b"\r\nPrefer: wait=3\r\n", 1))
+            head = await reader.readuntil(b"\r\n\r\n")
+            (date,) = (line for line in head.split(b"\r\n") if line.startswith(b"date: "))
+            assert time.time() - parsedate_to_datetime(date[6:].decode()).timestamp() < 3
             writer.close()
 
     play(scenario)
