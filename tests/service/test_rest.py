@@ -7,6 +7,7 @@ import json
 import zipfile
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import httpx2
 import numpy as np
@@ -53,6 +54,15 @@ def test_the_name_of_the_result_never_holds_a_path_or_a_line_break(server: Runni
         answer = curl("--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=1&filename={name}")
         assert answer.headers["content-disposition"] == 'attachment; filename="scan_clean.npy"'
         assert "x-evil" not in answer.headers
+
+
+def test_the_name_of_the_result_can_be_that_of_a_file(server: RunningServer, cloud: Path) -> None:
+    for name in ("点" * 83 + ".npy", "🙂" * 200 + ".npy"):  # the first is as long as a file's name may be
+        url = f"{server.url}/denoise?iterations=1&filename={quote(name)}"
+        told = curl("--data-binary", f"@{cloud}", url).headers["content-disposition"]
+        saved = unquote(told.removeprefix("attachment; filename*=utf-8''"), errors="strict")
+        assert 250 <= len(saved.encode()) <= 255
+        assert saved == f"{name[0] * (len(saved) - 10)}_clean.npy"
 
 
 def test_the_result_has_the_format_that_was_asked_for(server: RunningServer, cloud: Path) -> None:
