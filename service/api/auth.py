@@ -13,7 +13,7 @@ from fastapi.security import HTTPBearer
 
 from straightpcf.points.errors import RateLimited, Unauthorized
 
-__all__ = ["Gate", "owner_of"]
+__all__ = ["Gate", "owner_of", "owner_who_gives_back"]
 
 _SECONDS = 60.0
 # Says so in the OpenAPI document; it is the gate that checks.
@@ -35,11 +35,14 @@ class Gate:
         """Tell whether everyone may come in."""
         return not self._digests
 
-    def admit(self, authorization: str | None) -> str:
-        """Return the owner that a request's Authorization header stands for; raises Unauthorized, RateLimited."""
+    def admit(self, authorization: str | None, *, gives_back: bool = False) -> str:
+        """Return the owner that a request's Authorization header stands for; raises Unauthorized, RateLimited.
+
+        gives_back: it ends or deletes a job, which is counted, but never refused: the job would run on for nobody.
+        """
         owner = "" if self.open else self._owner(authorization)
         if self._rate > 0:
-            self._count(owner)
+            self._count(owner, gives_back)
         return owner
 
     def _owner(self, authorization: str | None) -> str:
@@ -52,7 +55,7 @@ class Gate:
             raise Unauthorized("this server does not know that API key")
         return digest.hex()[:16]
 
-    def _count(self, owner: str) -> None:
+    def _count(self, owner: str, gives_back: bool) -> None:
         """Take one request from the owner's bucket, which fills at the rate and holds a minute's worth."""
         now = time.monotonic()
         left, at = self._buckets.get(owner, (float(self._rate), now))
@@ -60,7 +63,7 @@ class Gate:
         granted = left >= 1
         # What is refused takes nothing: whoever asks again too soon would never get in.
         self._buckets[owner] = (left - 1 if granted else left, now)
-        if not granted:
+        if not granted and not gives_back:
             error = RateLimited(f"this key may send {self._rate} requests a minute")
             error.retry_after = math.ceil((1 - left) * _SECONDS / self._rate)
             raise error
@@ -70,3 +73,9 @@ def owner_of(request: Request, _: Annotated[object, Depends(_BEARER)]) -> str:
     """Return who asks, as a FastAPI dependency."""
     gate: Gate = request.app.state.gate
     return gate.admit(request.headers.get("authorization"))
+
+
+def owner_who_gives_back(request: Request, _: Annotated[object, Depends(_BEARER)]) -> str:
+    """Return who asks for the end of a job, however often."""
+    gate: Gate = request.app.state.gate
+    return gate.admit(request.headers.get("authorization"), gives_back=True)

@@ -29,6 +29,7 @@ __all__ = ["Caller", "Context", "LateParsing", "answering"]
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
 _CANCELLED_WITHIN_SECONDS = 1.0
+_GIVE_BACK = frozenset({"CancelJob", "DeleteJob"})
 
 Context: TypeAlias = grpc.aio.ServicerContext[Any, Any]
 
@@ -85,7 +86,7 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
     try:
         await context.send_initial_metadata((("x-request-id", id),))
         yield Caller(
-            owner=gate.admit(said.get("authorization")),
+            owner=gate.admit(said.get("authorization"), gives_back=method in _GIVE_BACK),
             request_id=id,
             idempotency_key=checked_key(said.get("idempotency-key")),
             traceparent=said.get("traceparent"),

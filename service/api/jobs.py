@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse, Response
 
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
-from straightpcf.service.api.auth import owner_of
+from straightpcf.service.api.auth import owner_of, owner_who_gives_back
 from straightpcf.service.api.download import open_result, result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
 from straightpcf.service.api.intake import Coming, take_job
@@ -36,6 +36,7 @@ __all__ = ["job_response", "router", "shown"]
 
 router = APIRouter(tags=["jobs"])
 Owner = Annotated[str, Depends(owner_of)]
+OwnerWhoGivesBack = Annotated[str, Depends(owner_who_gives_back)]
 
 
 def shown(request: Request, record: JobRecord) -> Job:
@@ -127,7 +128,7 @@ async def job_events(
     "/jobs/{id}/cancel", status_code=202, response_model=Job, summary="Cancel a job",
     responses={200: {"model": Job, "description": "It was finished before."}, **problems(401, 403, 404, 507)},
 )  # fmt: skip
-async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
+async def cancel_job(id: str, request: Request, owner: OwnerWhoGivesBack) -> Response:
     """Cancel a job that waits or runs; its worker is free within a second."""
     engine: Engine = request.app.state.engine
     before = await engine.get(id, owner=owner)
@@ -136,7 +137,7 @@ async def cancel_job(id: str, request: Request, owner: Owner) -> Response:
 
 
 @router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")
-async def delete_job(id: str, request: Request, owner: Owner) -> None:
+async def delete_job(id: str, request: Request, owner: OwnerWhoGivesBack) -> None:
     """Remove a job, its files and its events, whatever its state; also one whose file is still on its way."""
     coming: Coming = request.app.state.coming
     await coming.delete(owner, id)
