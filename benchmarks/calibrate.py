@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,11 @@ from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.archive import opened
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
-from straightpcf.points.errors import MalformedFile
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 
 _Key = tuple[str, str, float]  # of a trace: its cloud, type and size of noise
+_Floats = npt.NDArray[np.float64]
+_ALONG_BEAMS = "beams"  # noise of scans (`model.train.scanned`): of that std, along the way to the scanner
 
 # The table is read of every fifth shape's 50K points: with 3 % of noise d is lower there than at 10K, and noise read
 # too low costs more than noise read too high (docs/filter.md).
@@ -53,11 +54,15 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="weights whose DistanceModule and calibration to keep as they are")
     parser.add_argument("--data", type=Path, default=SHARED / "data" / "punet_train.npz")
     parser.add_argument(
-        "--clouds", nargs="+", help="<shape>/<resolution>; by default every shape at 10000, every eighth at 50000"
+        "--clouds",
+        nargs="+",
+        help="<shape>/<resolution>, or about that, of a scan; by default every shape at 10000, every eighth at 50000",
     )
     parser.add_argument("--traces", type=file_to_write, help="keep what was measured here, and use what is there")
     parser.add_argument("--noise", type=noise_level, nargs="+", default=NOISE_LEVELS)
-    parser.add_argument("--noise-type", choices=tuple(NOISE_TYPES), default="gaussian")
+    parser.add_argument(
+        "--noise-type", choices=(*NOISE_TYPES, _ALONG_BEAMS), default="gaussian", help="beams: of an archive of scans"
+    )
     parser.add_argument("--threads", type=positive, default=None)
     parser.add_argument("--out", type=file_to_write, nargs="?", const=DEFAULT_WEIGHTS, default=None)
     arguments = parser.parse_args()
@@ -81,9 +86,12 @@ def main() -> None:
         take_distance_module(network, arguments.distance)
     with opened(arguments.data) as archive:
         shapes = sorted({key.split("/")[0] for key in archive.files})
-        dense = _read(archive, [f"{shape}/{_TABLE_CLOUDS}" for shape in shapes[1::_TABLE_EVERY]])
         every = [f"{shape}/10000" for shape in shapes] + [f"{shape}/50000" for shape in shapes[3::8]]
-        clouds = _read(archive, arguments.clouds or every)
+        clouds = {name: _Cloud.read(archive, name) for name in arguments.clouds or every}
+        dense = {}
+        if arguments.table is None:
+            names = [f"{shape}/{_TABLE_CLOUDS}" for shape in shapes[1::_TABLE_EVERY]]
+            dense = {name: _Cloud.read(archive, name).clean for name in names}
     model = Filter(network, threads=arguments.threads)
     if arguments.table is None:
         model.calibration = noise_table(model, dense)
@@ -115,9 +123,35 @@ def _write(network: StraightPCF, progress: dict[str, Any], calibration: Calibrat
         print(f"written {out}")
 
 
-def _read(archive: Mapping[str, npt.NDArray[np.float32]], names: list[str]) -> dict[str, npt.NDArray[np.float64]]:
-    clouds = {name: archive[name].astype(np.float64) for name in names}
-    return {name: CloudFrame.of(xyz).enter(xyz) for name, xyz in clouds.items()}
+@dataclass(frozen=True)
+class _Cloud:
+    """A clean cloud (N, 3) in the unit ball, and of a scan the place (3,) it was seen from."""
+
+    clean: _Floats
+    eye: _Floats | None
+
+    @classmethod
+    def read(cls, archive: np.lib.npyio.NpzFile, name: str) -> _Cloud:
+        """Read <shape>/<resolution>, or of a scan, whose counts are what its beams met, the one nearest to it."""
+        shape, _, wanted = name.partition("/")
+        eye = archive[f"{shape}/eye"].astype(np.float64)[None] if f"{shape}/eye" in archive.files else None
+        if eye is not None and wanted.isdecimal():
+            counts = [n.removeprefix(f"{shape}/") for n in archive.files if n.startswith(f"{shape}/")]
+            nearest = min(filter(str.isdecimal, counts), key=lambda count: abs(int(count) - int(wanted)))
+            name = f"{shape}/{nearest}"
+        xyz = archive[name].astype(np.float64)
+        frame = CloudFrame.of(xyz)
+        return cls(frame.enter(xyz), None if eye is None else frame.enter(eye)[0])
+
+    def with_noise(self, kind: str, std: float) -> _Floats:
+        if kind != _ALONG_BEAMS:
+            return make_noise(kind, self.clean, std, seed=0)
+        if self.eye is None:
+            raise InvalidOptions("noise along beams is of scans: the archive has no <shape>/eye")
+        beams = self.clean - self.eye
+        along = std * np.random.default_rng(0).standard_normal((len(beams), 1))
+        noisy: _Floats = self.clean + along * beams / np.linalg.norm(beams, axis=1, keepdims=True)
+        return noisy
 
 
 def _recorded(kept: Path | None) -> dict[_Key, Trace]:
@@ -133,14 +167,14 @@ def _recorded(kept: Path | None) -> dict[_Key, Trace]:
 
 
 def _traces(
-    filter_: Filter, clouds: dict[str, npt.NDArray[np.float64]], kind: str, noise: list[float],
+    filter_: Filter, clouds: dict[str, _Cloud], kind: str, noise: list[float],
     known: dict[_Key, Trace], kept: Path | None,
 ) -> list[Trace]:  # fmt: skip
-    for name, clean in clouds.items():
+    for name, cloud in clouds.items():
         for std in noise:
             if (name, kind, std) in known:
                 continue
-            measured = trace(filter_, name, clean, make_noise(kind, clean, std, seed=0), std, kind)
+            measured = trace(filter_, name, cloud.clean, cloud.with_noise(kind, std), std, kind)
             known[name, kind, std] = measured
             if kept is not None:
                 with kept.open("a") as file:

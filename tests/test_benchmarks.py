@@ -179,6 +179,21 @@ def test_what_is_no_trace_is_named_by_its_line_before_the_work(refused: Refused,
         assert f"{traces}: line 2 is no trace" in said
 
 
+def test_scans_are_traced_with_noise_along_their_beams(refused: Refused, tmp_path: Path) -> None:
+    xyz = sphere(1000)
+    np.savez(tmp_path / "scans.npz", **{"a/470": xyz[xyz[:, 2] > 0.06], "a/90": xyz[:90], "a/eye": [0.0, 0, 30]})
+    np.savez(tmp_path / "whole.npz", **{"a/500": xyz[:500]})
+    traces = tmp_path / "traces.jsonl"
+    options = ("--state", DEFAULT_WEIGHTS, "--table", DEFAULT_WEIGHTS, "--clouds", "a/500", "--noise-type", "beams")
+    noise = ("--noise", 0.01, "--threads", 1, "--traces", traces)
+    assert "a/500" in printed("calibrate", *options, *noise, "--data", tmp_path / "scans.npz")
+    recorded = json.loads(traces.read_text())
+    assert (recorded["cloud"], recorded["noise_type"]) == ("a/500", "beams")
+    assert recorded["chamfer"][0] < 2 * 0.01**2  # in all three directions it is up to three times as much
+    code, said = refused("calibrate", *options, *noise[:4], "--data", tmp_path / "whole.npz")
+    assert (code, "no <shape>/eye" in said) == (1, True)
+
+
 @pytest.mark.parametrize("points", [("--resolution", 1000), ("--random", "--resolution", 700)])
 def test_candidates_are_compared_on_what_is_held_out(points: tuple[object, ...], tmp_path: Path) -> None:
     clouds = {f"{name}/1000": sphere(1000) for name in "abcdefghijkl"}
