@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 __all__ = ["Distinct", "box_of", "cell_of", "half_reach"]
 
@@ -17,6 +20,12 @@ Floats = npt.NDArray[np.float64]
 # and what is seen in their patches is no noise.
 _CELL_EXPONENT = -20
 _SOME = 10_000  # positions that tell how large a cloud is
+# Where three positions in ten have another within the first ratio of what their 8th is away, there are copies, such as
+# one scan by two exports or registrations, and what is within the second is one. Of points drawn at random on a surface
+# 0.4 % are within the first and 1.7 % within the second, on a line 16 and 30 %; of six real scans 0.1 %.
+_COPY_NEIGHBOURS, _COPY_RATIO, _JOINED_RATIO, _COPIED_SHARE = 8, 0.025, 0.05, 0.3
+_COPIES_LOOKED_AT = 2000  # positions that tell whether there are copies
+_BLOCK = 2**16  # positions whose neighbours are held at once
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits
 
 
@@ -25,17 +34,17 @@ class Distinct:
 
     xyz: (U, 3) float64, the position of one point of each; inverse: (N,) the place of each point. Where no two points
     share one, both keep the order. cell: points that lie in one cell of that edge, in the cloud's unit, are in one
-    place; 0 leaves equal points. There are two grids, half a cell apart; pairs that a border of each parts stay two.
+    place, and so are copies (`_copies`); 0 leaves equal points. There are two grids, half a cell apart; pairs that a
+    border of each parts stay two.
     """
 
     def __init__(self, xyz: Floats, *, cell: float = 0.0) -> None:
         self.xyz, self.inverse, self.repeated = xyz, np.arange(len(xyz)), False
         # One grid after the other, of what the first has left: links through both could chain a whole dense part.
         for rounding in (np.floor, np.rint) if cell else (None,):
-            grouped = _grouped(self.xyz, cell, rounding)
-            if grouped is not None:
-                first, group = grouped
-                self.xyz, self.inverse, self.repeated = self.xyz[first], group[self.inverse], True
+            self._join(_grouped(self.xyz, cell, rounding))
+        if cell:
+            self._join(_copies((self.xyz / 2 - self.xyz[0] / 2) / cell))  # halves: else both might overflow
         if not self.repeated:
             return
         by_position = np.lexsort(self.xyz.T[::-1])
@@ -44,6 +53,12 @@ class Distinct:
         self.xyz, self.inverse = self.xyz[by_position], place[self.inverse]
         self._order = np.argsort(self.inverse, kind="stable")
         self._starts = np.searchsorted(self.inverse[self._order], np.arange(len(place) + 1))
+
+    def _join(self, grouped: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None) -> None:
+        """Make one place of each group of places: the first row of each, and each place's group; None joins none."""
+        if grouped is not None:
+            first, group = grouped
+            self.xyz, self.inverse, self.repeated = self.xyz[first], group[self.inverse], True
 
     def copies(self, distinct: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the points that lie at some distinct rows."""
@@ -99,6 +114,30 @@ def _grouped(
             _, first, group = np.unique(cells, axis=0, return_index=True, return_inverse=True)
             break
     return None if len(first) == len(xyz) else (first, group.reshape(-1))
+
+
+def _copies(xyz: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """Do what `_grouped` does for copies farther apart than a cell; None where few positions have any.
+
+    xyz: (U, 3) positions, from one of them, in a unit in which their squares do not overflow. How far is told by each
+    one's own neighbours: by one distance for all, dense parts would be one place.
+    """
+    count = len(xyz)
+    if count <= _COPY_NEIGHBOURS:
+        return None
+    tree = cKDTree(xyz)
+    near, _ = tree.query(xyz[:: max(1, count // _COPIES_LOOKED_AT)], k=[2, _COPY_NEIGHBOURS + 1])
+    if (near[:, 0] < _COPY_RATIO * near[:, 1]).mean() < _COPIED_SHARE:
+        return None
+    links = []
+    for start in range(0, count, _BLOCK):
+        near, index = tree.query(xyz[start : start + _BLOCK], k=_COPY_NEIGHBOURS + 1)
+        row, column = np.nonzero(near[:, :-1] < _JOINED_RATIO * near[:, -1:])
+        links.append((row + start, index[row, column]))
+    rows, others = map(np.concatenate, zip(*links, strict=True))
+    graph = coo_array((np.ones(len(rows), dtype=bool), (rows, others)), shape=(count, count))
+    _, first, group = np.unique(connected_components(graph)[1], return_index=True, return_inverse=True)
+    return first, group
 
 
 def _hashed(xyz: Floats, cell: float, rounding: np.ufunc | None) -> npt.NDArray[np.uint64]:

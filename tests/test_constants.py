@@ -27,7 +27,7 @@ NOT_TUNED = {
     "checkpoint.py": {"MAX_COUPLINGS", "MAX_WIDTH", "MAX_OFFICIAL_BYTES"},
     "cpus.py": {"_IMPORTED_IN"},  # a process
     "device_patches.py": {"_DISTANCES"},
-    "distinct.py": {"_GOLDEN"},
+    "distinct.py": {"_GOLDEN", "_BLOCK"},
     "low_noise.py": {"_FIT_TERMS", "_RIDGE"},  # a quadric's six
     "metrics.py": {"PAIRS_AT_ONCE", "FIRST_NEIGHBOURS", "SLIVER"},
     "neighbourhoods.py": {"_LEAST_RADIUS"},

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from straightpcf.model import distinct
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.filter import Filter, load_filter
-from tests.clouds import far_group, noisy, sphere, torus
+from tests.clouds import distance_to_torus, far_group, noisy, sphere, torus
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,32 @@ def test_a_scan_and_its_float32_copy_are_one() -> None:
     assert len(np.unique(found.inverse[:20_000])) == len(xyz)
 
 
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("jitter", [1e-5, 3e-4])
+def test_a_scan_and_its_copies_of_few_decimals_or_moved_a_little_are_one(jitter: float, times: int) -> None:
+    xyz = noisy(torus(3000), 0.01)
+    copies = noisy(np.tile(xyz, (times, 1)), jitter, seed=3)
+    found = near(copies)
+    assert 2950 <= len(found.xyz) <= 3050  # chance puts a few points as near to others
+    assert (found.inverse.reshape(times, -1) == found.inverse[:3000]).mean() > 0.97
+    assert np.linalg.norm(found.xyz[found.inverse] - copies, axis=1).max() < 0.01  # a tenth of what the 8th is away
+    np.testing.assert_array_equal(near(copies * 2.0**1000).inverse, found.inverse)
+
+
+def test_copies_are_looked_for_where_all_points_share_a_coordinate_however_large() -> None:
+    sheet = np.random.default_rng(0).uniform(size=(500, 3)) * [1e-10, 1e-10, 0] + [0, 0, 1e300]
+    assert len(near(sheet).xyz) > 490
+
+
+def test_points_that_chance_puts_near_one_another_stay_apart() -> None:
+    rng = np.random.default_rng(0)
+    line, sheet = rng.uniform(size=(5000, 1)) * [1, 0, 0], rng.uniform(size=(5000, 3)) * [1, 1, 0]
+    dense = np.vstack([sheet, 1e-3 * sheet])  # all of its points are near one another beside the others' distance
+    rings = np.stack([np.tile(np.arange(1000) / 1000, 8), np.repeat(np.arange(8.0), 1000), np.zeros(8000)], axis=1)
+    for cloud in (line, sheet, dense, rings, np.vstack([torus(5000), torus(500)])):  # some copies are few
+        assert len(near(cloud).xyz) > 0.98 * len(np.unique(cloud, axis=0))
+
+
 def test_far_points_do_not_make_one_place_of_all_others() -> None:
     cloud = np.vstack([noisy(torus(1200), 0.01), far_group(1e8)])
     assert len(near(cloud).xyz) >= 1200
@@ -86,6 +112,17 @@ def test_every_point_is_among_the_copies_of_its_place() -> None:
     copies = [found.copies(np.array([place], dtype=np.int32)) for place in range(len(found.xyz))]
     assert np.array_equal(np.sort(np.concatenate(copies)), np.arange(600))
     assert all((found.inverse[rows] == place).all() for place, rows in enumerate(copies))
+
+
+def test_a_scan_given_twice_comes_out_as_the_scan_does(shipped: Filter) -> None:
+    """Pairs of points are each other's nearest, and noise that both of a pair have was read as none."""
+    cloud = noisy(torus(3000), 0.01)
+    twice = np.vstack([cloud, np.round(cloud, 3)])
+    alone, both = shipped.denoise(cloud), shipped.denoise(twice)
+    left, of_alone = (float(np.sqrt(np.square(distance_to_torus(r.xyz)).mean())) for r in (both, alone))
+    assert left == pytest.approx(of_alone, rel=0.1)  # 0.0095 of 0.0102 stayed
+    assert both.noise_before == pytest.approx(alone.noise_before, rel=0.15)
+    assert np.linalg.norm((both.xyz - twice)[:3000] - (both.xyz - twice)[3000:], axis=1).mean() < 1e-3
 
 
 def test_near_copies_take_no_noise_away_from_the_filter(shipped: Filter) -> None:
