@@ -24,7 +24,9 @@ _SOME = 10_000  # positions that tell how large a cloud is
 # one scan by two exports or registrations, and what is within the second is one. Of points drawn at random on a surface
 # 0.4 % are within the first and 1.7 % within the second, on a line 16 and 30 %; of six real scans 0.1 %.
 _COPY_NEIGHBOURS, _COPY_RATIO, _JOINED_RATIO, _COPIED_SHARE = 8, 0.025, 0.05, 0.3
-_COPIES_LOOKED_AT = 2000  # positions that tell whether there are copies
+# A tree of all positions takes longer than all else that is done before a GPU has them: so many of the positions
+# nearest to some, of so many nearest to those, tell whether there are copies.
+_LOOKED_AT_PLACES, _LOOKED_AT, _AROUND_THEM = 8, 64, 256
 _BLOCK = 2**16  # positions whose neighbours are held at once
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # odd, the golden ratio's bits
 
@@ -123,13 +125,9 @@ def _copies(xyz: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] 
     one's own neighbours: by one distance for all, dense parts would be one place.
     """
     count = len(xyz)
-    if count <= _COPY_NEIGHBOURS:
+    if count <= _COPY_NEIGHBOURS or not _are_copied(xyz):
         return None
-    tree = cKDTree(xyz)
-    near, _ = tree.query(xyz[:: max(1, count // _COPIES_LOOKED_AT)], k=[2, _COPY_NEIGHBOURS + 1])
-    if (near[:, 0] < _COPY_RATIO * near[:, 1]).mean() < _COPIED_SHARE:
-        return None
-    links = []
+    tree, links = cKDTree(xyz), []
     for start in range(0, count, _BLOCK):
         near, index = tree.query(xyz[start : start + _BLOCK], k=_COPY_NEIGHBOURS + 1)
         row, column = np.nonzero(near[:, :-1] < _JOINED_RATIO * near[:, -1:])
@@ -138,6 +136,17 @@ def _copies(xyz: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] 
     graph = coo_array((np.ones(len(rows), dtype=bool), (rows, others)), shape=(count, count))
     _, first, group = np.unique(connected_components(graph)[1], return_index=True, return_inverse=True)
     return first, group
+
+
+def _are_copied(xyz: Floats) -> bool:
+    shares = []
+    for centre in xyz[:: math.ceil(len(xyz) / _LOOKED_AT_PLACES)]:
+        apart = sum(np.square(xyz[:, axis] - centre[axis]) for axis in range(3))
+        around = np.argpartition(apart, _AROUND_THEM)[:_AROUND_THEM] if len(xyz) > _AROUND_THEM else np.arange(len(xyz))
+        around = around[np.argsort(apart[around])]
+        near, _ = cKDTree(xyz[around]).query(xyz[around[:_LOOKED_AT]], k=[2, _COPY_NEIGHBOURS + 1])
+        shares.append((near[:, 0] < _COPY_RATIO * near[:, 1]).mean())
+    return bool(np.mean(shares) >= _COPIED_SHARE)
 
 
 def _hashed(xyz: Floats, cell: float, rounding: np.ufunc | None) -> npt.NDArray[np.uint64]:
