@@ -13,14 +13,11 @@ from straightpcf.points.errors import MalformedFile
 
 __all__ = ["Calibration"]
 
-# d of noise that one pass takes most of: little, and what leaves more of thin bodies (1.5 to 2 %).
-_LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.75, 0.87
-# As `stuck`, of d between those two where no walls were seen; more by so much for each radius of a patch that the noise
-# is above so many: of dense points a pass leaves more, and walls that are read as noise are read as little in radii.
-_STUCK_WITH_MORE_NOISE, _STUCK_BY_RADIUS, _STUCK_FROM_RADII = 0.7, 8.0, 0.03
-# What scenes have instead of the fitted limits, which are of objects: as they were before, when scans were looked at.
-_SCENE_STARTS = (0.45, 0.815, 0.945)
-_SCENE_POLISH, _SCENE_SETTLED = (0.22, 0.62, 0.86, 0.92), (0.18, 0.18, 0.22, 0.22)
+# d of noise that one pass takes most of: hardly any, little, and what leaves more of thin bodies (1.5 to 2 %).
+_LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
+# What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
+# a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
+_STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, _STUCK_FROM_RADII = 0.7, 8.0, 0.03
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
 
@@ -36,9 +33,11 @@ class Calibration:
     pull their sides together.
     crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
     dense points the second leaves more than of few.
-    stuck: where a second pass is due, but d after the first is more than this share of d at the start, and that was
-    below _LITTLE_NOISE_DISTANCE, walls close together were read, not noise, or rods: further passes would join them.
+    stuck: where a second pass is due, but d after the first is more than this share of d at the start, walls close
+    together were read, not noise, or rods, or what is left of shapes without any: further passes would join them.
     stirred: d above which noise is left whatever was done. most: passes in all.
+    scene_starts, scene_polish, scene_settled: what scenes have instead, which `calibrate` does not fit: their further
+    passes thin poles and wires, and d does not tell.
     """
 
     distances: tuple[float, ...] = (0.0, 1.0)
@@ -50,13 +49,19 @@ class Calibration:
     stuck: float = 0.61
     stirred: float = 0.5
     most: int = 4
+    scene_starts: tuple[float, ...] = (0.45, 0.815, 0.945)
+    scene_polish: tuple[float, ...] = (0.22, 0.62, 0.86, 0.92)
+    scene_settled: tuple[float, ...] = (0.18, 0.18, 0.22, 0.22)
 
     def __post_init__(self) -> None:
         """Refuse tables that cannot be looked up in."""
         if len(self.distances) != len(self.noise) or len(self.noise) < 2 or np.any(np.diff(self.distances) <= 0):
             raise MalformedFile("the calibration's distances must rise and be as many as its noise levels, 2 at least")
-        if len(self.polish) != len(self.settled):
-            raise MalformedFile(f"the calibration has {len(self.polish)} of polish and {len(self.settled)} of settled")
+        for of, polish, settled in (("", self.polish, self.settled), ("scene_", self.scene_polish, self.scene_settled)):
+            if len(polish) != len(settled):
+                raise MalformedFile(
+                    f"the calibration has {len(polish)} of {of}polish and {len(settled)} of {of}settled"
+                )
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Calibration:
@@ -79,8 +84,8 @@ class Calibration:
         return np.interp(distances, self.distances, self.noise)
 
     def of_scenes(self) -> Calibration:
-        """Return the calibration that scenes have: their further passes thin poles and wires, and d does not tell."""
-        return replace(self, starts=_SCENE_STARTS, polish=_SCENE_POLISH, settled=_SCENE_SETTLED)
+        """Return the calibration that scenes have."""
+        return replace(self, starts=self.scene_starts, polish=self.scene_polish, settled=self.scene_settled)
 
     def passes_left(
         self,
@@ -98,11 +103,11 @@ class Calibration:
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = max(1 + sum(start > limit for limit in self.starts), _PASSES_OF_SHOWN_WALLS if shown_walls else 1)
-        little = thin_walls or start < _LITTLE_NOISE_DISTANCE
         stuck = self.stuck
-        if not little:
-            more = _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _STUCK_FROM_RADII)
-            stuck = max(stuck, _STUCK_WITH_MORE_NOISE + more)
+        if not thin_walls:
+            little = _LEAST_NOISE_DISTANCE <= start < _LITTLE_NOISE_DISTANCE
+            stuck = stuck if little else max(stuck, _STUCK_WITHOUT_WALLS)
+            stuck += _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _STUCK_FROM_RADII)
         if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)

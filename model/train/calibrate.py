@@ -21,8 +21,8 @@ __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_ta
 
 # What `calibrate` chooses from: every combination.
 _LIMITS: dict[str, tuple[Any, ...]] = {
-    "starts": tuple(product((0.45, 0.50, 0.73), (0.75, 0.78, 0.815, 0.85), (0.9, 0.945))),
-    "polish": tuple(product((0.22, 0.26), (0.62,), (0.74, 0.78, 0.82, 0.86), (0.9, 0.92))),
+    "starts": tuple(product((0.21, 0.28, 0.45, 0.73), (0.75, 0.815, 0.85), (0.9, 0.945))),
+    "polish": tuple(product((0.22, 0.35, 0.45), (0.62,), (0.74, 0.78, 0.82, 0.86), (0.9, 0.92))),
     # Before the second pass, the third, the fourth and fifth.
     "settled": tuple(
         (little, few, many, many)

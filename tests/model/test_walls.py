@@ -12,7 +12,7 @@ from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
-from straightpcf.model.walls import WALL_PATCHES_SHARE, share_between_walls
+from straightpcf.model.walls import WALL_PATCHES_SHARE, has_walls, share_between_walls
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import even_sphere, noisy, sphere
 
@@ -114,6 +114,23 @@ def test_a_noisy_surface_has_no_walls_after_a_pass() -> None:
     for rough in (noisy(even_sphere(8000), 0.005), noisy(plate(2000, 0.0), 0.01)):
         patches = cut_patches(rough, coverage=3.0, seed=0)
         assert not Sampling.of(rough, patches, 0.0).after_pass(rough, patches).thin_walls
+
+
+@pytest.mark.parametrize(
+    ("shares", "walls"),
+    [
+        ((0.29, 0.30, 0.32, 0.34), False),  # `boy02`, 10K, uniform noise of 3 %: four fifths were held back, for walls
+        ((0.28, 0.31, 0.33, 0.34), False),  # `boy02`, 50K, 2 %
+        ((0.24, 0.24, 0.26, 0.30), True),  # a table, its plate 0.025 thick, 1 %
+        ((0.27, 0.28, 0.31, 0.34), True),  # 1.5 %
+    ],
+)
+def test_layers_that_a_pass_leaves_of_noise_without_tails_are_no_walls(
+    shares: tuple[float, ...], *, walls: bool
+) -> None:
+    """Recorded: the share of neighbours that are midway, as 10, 20, 40 and 80 % of the patches have it."""
+    midway = np.interp(np.linspace(0, 1, 50), (0.1, 0.2, 0.4, 0.8), shares)
+    assert has_walls(np.stack([midway, np.ones(50)], axis=1), uncovered=True) == walls
 
 
 def test_a_sheet_that_a_pass_leaves_in_two_layers_has_no_walls() -> None:
