@@ -40,6 +40,9 @@ _REREAD_FROM, _REREAD_ABOVE = 0.4, 0.95
 _NEAR_RADIUS = 0.15
 # Of d after a pass: below it, what still has height is walls. With more noise left (0.42) a smooth body looks so, too.
 _UNCOVERED_BELOW = 0.35
+# Noise, in radii of a patch, above which it is not asked: of dense points a pass leaves layers of uniform noise, and it
+# joins no walls there.
+_UNCOVERED_UP_TO_RADII = 0.045
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
@@ -163,8 +166,9 @@ class NoiseReader:
 
     def with_walls(self, positions: Floats, reading: Reading, first: Reading) -> Reading:
         """Return the reading of what a pass has left, before another: walls that noise had hidden may show now."""
-        covered = reading.distance >= _UNCOVERED_BELOW or first.parts != (1,)  # what parts leave lies in layers
-        if reading is first or reading.scene or covered or reading.probes is None:
+        covered = reading.distance >= _UNCOVERED_BELOW
+        layered = first.parts != (1,) or first.noise_in_radii > _UNCOVERED_UP_TO_RADII
+        if reading is first or reading.scene or covered or layered or reading.probes is None:
             return reading
         sampling = first.sampling.after_pass(positions, reading.probes, survey=self._processor.survey)
         return replace(reading, sampling=sampling)
