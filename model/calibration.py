@@ -17,9 +17,9 @@ __all__ = ["Calibration"]
 _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
 # What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
 # a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
-_STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, _STUCK_FROM_RADII = 0.7, 8.0, 0.03
-# Of dense points a third pass leaves more of uniform noise, which reads as little: d of 0.17 to 0.2, where one or two
-# more are worth it. Of Gaussian noise it leaves 0.11 to 0.16, of thin shapes 0.19, and more hardly harm these.
+_STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, _DENSE_FROM_RADII = 0.7, 8.0, 0.03
+# Of dense points two and three passes leave more of uniform noise and of noise along beams, which read as little: d of
+# 0.17 to 0.24, where one or two more are worth it. Of Gaussian noise 0.11 to 0.16 is left, and 0.19 of thin shapes.
 _LEFT_OF_DENSE = 0.17
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
@@ -110,14 +110,15 @@ class Calibration:
         if not thin_walls:
             little = _LEAST_NOISE_DISTANCE <= start < _LITTLE_NOISE_DISTANCE
             stuck = stuck if little else max(stuck, _STUCK_WITHOUT_WALLS)
-            stuck += _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _STUCK_FROM_RADII)
+            stuck += _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _DENSE_FROM_RADII)
         if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
-        dense = polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1
-        polished += dense
+        dense = polished == 2 and noise_in_radii > _DENSE_FROM_RADII and not thin_walls
+        left = dense and done >= 2 and now > _LEFT_OF_DENSE
+        if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:
+            polished = 3
         polishing = due <= done < polished and now < self.settled[done - 1]
-        left = dense and not thin_walls and done >= polished and now > _LEFT_OF_DENSE
         if done >= self.most or not (done < due or polishing or left or now > self.stirred):
             return 0
         return 1 if done == self.most - 1 or (polishing and done == polished - 1 and not dense) else 2

@@ -59,7 +59,7 @@ def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> 
     distances = (0.55, 0.325, 0.202, 0.171, 0.142, 0.132)  # `special_cube`, 50K, uniform noise of 3 %
     fitted = Calibration(starts=(0.21, 0.75), polish=(0.35, 0.76), settled=(0.18, 0.3), most=5)
     assert passes(fitted, Trace("uniform", 0.03, distances, (), noise_in_radii=0.046)) == 4
-    assert passes(fitted, Trace("few", 0.03, distances, (), noise_in_radii=0.04)) == 2
+    assert passes(fitted, Trace("few", 0.03, distances, (), noise_in_radii=0.02)) == 2
 
 
 @pytest.mark.parametrize(
