@@ -28,6 +28,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.train.archive import opened
 from straightpcf.model.train.calibrate import NOISE_LEVELS, Trace, calibrate, noise_table, passes, trace
+from straightpcf.model.train.data import along_beams
 from straightpcf.model.train.state import average_with, read_network, take_distance_module
 from straightpcf.points.errors import InvalidOptions, MalformedFile
 
@@ -148,10 +149,8 @@ class _Cloud:
             return make_noise(kind, self.clean, std, seed=0)
         if self.eye is None:
             raise InvalidOptions("noise along beams is of scans: the archive has no <shape>/eye")
-        beams = self.clean - self.eye
-        along = std * np.random.default_rng(0).standard_normal((len(beams), 1))
-        noisy: _Floats = self.clean + along * beams / np.linalg.norm(beams, axis=1, keepdims=True)
-        return noisy
+        noise = std * np.random.default_rng(0).standard_normal((len(self.clean), 1))
+        return self.clean + along_beams(noise, self.clean, self.eye)
 
 
 def _recorded(kept: Path | None) -> dict[_Key, Trace]:

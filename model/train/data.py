@@ -46,6 +46,7 @@ __all__ = [
     "Patch",
     "PatchSource",
     "Surface",
+    "along_beams",
     "drawn_noise",
     "gathered",
     "held_out_shapes",
@@ -345,10 +346,17 @@ def drawn_noise(
     noise = _scattered(rng, len(clean))
     if eye is None or rng.random() >= ALONG_BEAMS:
         return noise
+    return along_beams(noise[:, :1], clean, eye)
+
+
+def along_beams(
+    noise: npt.NDArray[np.float64], clean: npt.NDArray[np.float64], eye: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return noise (N, 1) as moves, (N, 3), along the beams from the place `eye` (3,) that met points (N, 3)."""
     beams = clean - eye
     length = np.linalg.norm(beams, axis=1, keepdims=True)
     # A scan's "nothing was met" often lies in the eye itself, and has no beam.
-    along: npt.NDArray[np.float64] = noise[:, :1] * beams / np.where(length > 0, length, 1.0)
+    along: npt.NDArray[np.float64] = noise * beams / np.where(length > 0, length, 1.0)
     return along
 
 
