@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from straightpcf.points.errors import ConnectionFailed, JobExpired, NotFound, RequestTimeout, ServerBusy
+from straightpcf.points.errors import ConnectionFailed, JobExpired, NotFound, RequestTimeout, ServerBusy, Unauthorized
 from straightpcf.points.formats import FORMATS
 
 __all__ = ["watch_folder"]
@@ -34,7 +34,8 @@ def watch_folder(
     which is still being written is left alone; one that failed is tried again when it changes, or, where only the
     server could not be had, at the next look, or, where the disk was full or `target` away, when more of it is free
     or it is back. A server that has lost a job, with its data, gets it once more. A `folder` that is away, as a share
-    may be, is said once, and waited for. Yields each outcome. once: look once, and end.
+    may be, is said once, and waited for. Yields each outcome. once: look once, and end. Raises Unauthorized: what a
+    server that wants another key says of one file it says of all.
     """
     suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
     tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
@@ -72,6 +73,8 @@ def watch_folder(
             try:
                 report = denoise(path, result)
                 os.utime(result, ns=(stamp[1], stamp[1]))
+            except Unauthorized:
+                raise
             except (ConnectionFailed, RequestTimeout, ServerBusy) as error:
                 yield path, error
             except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shlex
@@ -16,6 +17,8 @@ import pytest
 
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, clean_environment
+from tests.service.in_process import serving
+from tests.service.test_races import play, willing
 from tests.waiting import wait_for
 from tests.warm import MODEL, SDK, run_warm
 
@@ -307,6 +310,21 @@ def test_watch_takes_what_comes_later_from_a_server(server: RunningServer, scan:
         os.kill(process.pid, signal.SIGINT)
         process.wait(timeout=20)
     assert process.returncode == 130
+
+
+@pytest.mark.parametrize("key", [(), ("--api-key", "beta")])
+def test_watch_ends_where_a_server_does_not_take_its_key(scan: Path, key: tuple[str, ...]) -> None:
+    """In one line, as `submit` does: to every file it would say the same, and none would be tried again."""
+    scan.with_name("second.npy").write_bytes(scan.read_bytes())
+
+    async def scenario() -> None:
+        async with serving(scan.parent / "server", willing(), api_keys="alpha") as (_, host, port):
+            done = await asyncio.to_thread(cli, None, "watch", scan.parent, "--url", f"http://{host}:{port}", *key)
+            assert (done.returncode, done.stderr.count(b"\n")) == (3, 1), done.stderr
+            assert done.stderr.startswith(b"error [unauthorized]: ")
+
+    play(scenario)
+    assert not any((scan.parent / "clean").iterdir())
 
 
 def test_the_readme_downloads_a_result_with_curl_and_goes_on_with_half_of_it(server: RunningServer, scan: Path) -> None:
