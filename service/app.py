@@ -91,6 +91,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     app.state.coming = coming
     app.state.gate = gate
     app.state.weights = _weights_name(settings)
+    install_error_handlers(app)
     origins, hosts = settings.origins(), settings.hosts()
     if gate.open and is_loopback(settings.host):
         app.add_middleware(HostMiddleware, hosts=hosts, origins=origins)
@@ -99,7 +100,6 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
     if origins:
         app.add_middleware(CorsMiddleware, origins=origins)
     app.add_middleware(TargetMiddleware)
-    install_error_handlers(app)
     app.include_router(router)
     app.include_router(jobs_router)
     install_page(app)

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
+from starlette.middleware.errors import ServerErrorMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 
@@ -126,14 +127,16 @@ logger = logging.getLogger("uvicorn.error")
 
 
 def install_error_handlers(app: FastAPI) -> None:
-    """Answer every exception of an app, whoever raised it, with a problem."""
+    """Answer every exception of an app, whoever raised it, with a problem; to be called before middleware is added."""
     app.add_exception_handler(StraightPCFError, _ours)
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
     app.add_exception_handler(ClientDisconnect, _nobody_listens)
     app.add_exception_handler(OSError, _system)
     app.add_exception_handler(sqlite3.Error, _system)
-    app.add_exception_handler(Exception, _unforeseen)
+    # Not as an exception handler, whose answer passes by every middleware: a page of another origin (CORS) could not
+    # read it. This one is the innermost.
+    app.add_middleware(ServerErrorMiddleware, handler=_unforeseen)
 
 
 async def _ours(request: Request, error: Exception) -> Response:

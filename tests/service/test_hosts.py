@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from straightpcf.service.engine import Engine
 from tests.service.in_process import serving
 from tests.service.test_races import play, willing
 
@@ -157,3 +159,25 @@ def test_pages_that_are_named_may_have_work_done(tmp_path: Path) -> None:
 def test_looking_is_left_to_the_browser_and_keys_keep_pages_out(tmp_path: Path) -> None:
     assert not turned_away(tmp_path / "get", method="GET", path="/v1/info")
     assert not turned_away(tmp_path / "keys", api_keys="alpha")
+
+
+def test_a_named_page_can_read_an_unforeseen_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fail(engine: Engine, id: str, *, owner: str = "") -> None:
+        raise RuntimeError("nobody foresaw it")
+
+    monkeypatch.setattr(Engine, "get", fail)
+    answers = []
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing(), cors_origins="https://friend.example") as (_, host, port):
+            for origin in ("https://friend.example", "https://stranger.example"):
+                answers.append(await posted(host, port, origin, "GET", "/jobs/a"))
+
+    play(scenario)
+    for answer in answers:
+        assert answer.startswith(b"HTTP/1.1 500 ")
+        head, body = answer.lower().split(b"\r\n\r\n")
+        assert json.loads(body)["code"] == "internal_error"
+        assert f"x-request-id: {json.loads(body)['request_id']}".encode() in head
+    seen = [b"access-control-allow-origin: https://friend.example\r\n" in answer for answer in answers]
+    assert seen == [True, False]
