@@ -41,3 +41,28 @@ def test_a_job_that_another_deleted_can_be_deleted(page: Any, scan: Path, server
     page.wait_for_selector("#jobs", state="hidden")
     assert page.is_hidden("#report")
     assert page.is_hidden("#error")
+
+
+def test_a_result_that_the_page_cannot_show_can_be_downloaded(page: Any, scan: Path) -> None:
+    """Its job is done; the page said that it met an error of its own, and nothing of the report."""
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    page.route("**/stream", lambda route: route.fulfill(status=404, body="{}"))
+    page.route("**/result", lambda route: route.fulfill(status=200, body="ply\nbut no more of it"))
+    page.click("#submit")
+    page.wait_for_selector("#report:not([hidden])")
+    told = "This page could not show scan_clean.ply (no PLY header); download it to see it."
+    assert page.inner_text("#note") == told
+    assert page.is_hidden("#error")
+    assert page.get_attribute("#download", "download") == "scan_clean.ply"
+
+
+def test_a_result_that_is_gone_is_said_to_be(page: Any, scan: Path) -> None:
+    page.set_input_files("#file", scan)
+    page.select_option("#iterations", "1")
+    gone = '{"code": "not_found", "detail": "no such job"}'
+    page.route("**/stream", lambda route: route.fulfill(status=404, body=gone))
+    page.route("**/result", lambda route: route.fulfill(status=404, body=gone))
+    page.click("#submit")
+    page.wait_for_selector("#error:has-text('no such job')")
+    assert page.is_hidden("#report")

@@ -79,8 +79,16 @@ async function fromResult(job, cloud, hooks, signal) {
     hooks.onNote(`This page cannot read ${filename}; download it to see it.`);
     return null;
   }
-  const file = await (await call(`jobs/${encodeURIComponent(job.id)}/result`, { signal })).blob();
-  const { count, stride, xyz } = await readFile(file, filename);
+  let read;
+  try {
+    const file = await (await call(`jobs/${encodeURIComponent(job.id)}/result`, { signal })).blob();
+    read = await readFile(file, filename);
+  } catch (error) {
+    if (signal.aborted || (error.status && !error.retryable)) throw error;
+    hooks.onNote(`This page could not show ${filename} (${error.message}); download it to see it.`); // the job is done
+    return null;
+  }
+  const { count, stride, xyz } = read;
   signal.throwIfAborted();
   if (cloud?.count !== count) {
     cloud = new Cloud({ count, stride });
