@@ -15,9 +15,9 @@ from straightpcf.points.errors import MalformedFile
 from straightpcf.points.formats import lzf
 from straightpcf.points.formats.base import Format, check_count, check_room, check_unpacked
 from straightpcf.points.formats.colours import PACKED, packed
-from straightpcf.points.formats.pcd_header import PcdField, PcdHeader, read_header
+from straightpcf.points.formats.pcd_header import MAX_FIELDS, PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
-from straightpcf.points.formats.scalars import scalar_columns, with_intensity
+from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
 from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
 __all__ = ["Pcd"]
@@ -72,10 +72,16 @@ class Pcd(Format):
         source = PcdSource(raw, header, xyz.copy(), unpacked=unpacked)
         return PointCloud(xyz, _attributes(columns, header), source, beside=header.beside)
 
+    def check(self, cloud: PointCloud) -> None:
+        """Raise UnsupportedCloud where a new file has more fields than one may."""
+        if not isinstance(cloud.source, PcdSource):
+            check_columns(packed(cloud.attributes), MAX_FIELDS, what="PCD")
+
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with its positions replaced, or a new binary one."""
         source = cloud.source
         if not isinstance(source, PcdSource):
+            self.check(cloud)
             path.write_bytes(_new_file(cloud))
             return
         names, new, old = changes(cloud, source.xyz, source.header.axes)

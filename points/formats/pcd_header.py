@@ -11,7 +11,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.positions import axes_among
 from straightpcf.points.formats.text import shown
 
-__all__ = ["PcdField", "PcdHeader", "read_header"]
+__all__ = ["MAX_FIELDS", "PcdField", "PcdHeader", "read_header"]
 
 MAX_HEADER_BYTES = 1 << 20
 MAX_FIELDS = 4096

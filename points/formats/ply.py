@@ -13,7 +13,7 @@ from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import in_8_bits
-from straightpcf.points.formats.ply_header import BOM, PlyElement, PlyHeader, read_header
+from straightpcf.points.formats.ply_header import BOM, MAX_PROPERTIES, PlyElement, PlyHeader, read_header
 from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows, scalar_offsets
 from straightpcf.points.formats.positions import (
     AXES,
@@ -26,7 +26,7 @@ from straightpcf.points.formats.positions import (
     scattered,
     widened,
 )
-from straightpcf.points.formats.scalars import scalar_columns
+from straightpcf.points.formats.scalars import check_columns, scalar_columns
 from straightpcf.points.formats.text import blocks, refuse_binary, replaced
 
 __all__ = ["Ply"]
@@ -79,8 +79,9 @@ class Ply(Format):
         return PointCloud(xyz, attributes, source, beside=(*lists, *others))
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise UnsupportedCloud where the file's own positions are whole numbers, which moved ones are not."""
+        """Raise UnsupportedCloud where a file's own positions are whole numbers, or a new one has too many columns."""
         if not isinstance(cloud.source, PlySource):
+            check_columns(in_8_bits(cloud.attributes), MAX_PROPERTIES, what="PLY")
             return
         for prop in cloud.source.vertex.properties:
             if prop.name in cloud.source.axes and prop.dtype.kind != "f":
@@ -93,6 +94,7 @@ class Ply(Format):
         """Write the file that was read with its positions replaced, or a new binary one."""
         source = cloud.source
         if not isinstance(source, PlySource):
+            self.check(cloud)
             path.write_bytes(_new_file(cloud))
             return
         names, new, old = changes(cloud, source.xyz, source.axes)

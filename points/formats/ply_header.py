@@ -11,7 +11,16 @@ import numpy as np
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.text import shown
 
-__all__ = ["BOM", "MAX_HEADER_BYTES", "MAX_LINE_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "read_header"]
+__all__ = [
+    "BOM",
+    "MAX_HEADER_BYTES",
+    "MAX_LINE_BYTES",
+    "MAX_PROPERTIES",
+    "PlyElement",
+    "PlyHeader",
+    "PlyProperty",
+    "read_header",
+]
 
 BOM = b"\xef\xbb\xbf"  # that editors put before a text
 MAX_HEADER_BYTES = 1 << 20

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.positions import AXES
 
-__all__ = ["further_columns", "meant", "not_held", "scalar_columns", "with_intensity"]
+__all__ = ["check_columns", "further_columns", "meant", "not_held", "scalar_columns", "with_intensity"]
 
 _NAME_CHARACTERS = 64
 _WIDER = {"f2": "f4", "b1": "u1", "i8": "f8", "u8": "f8", "f16": "f8"}
@@ -63,6 +64,17 @@ def not_held(
         if changes:
             lost.append(f"{name} ({', '.join(changes)})")
     return lost
+
+
+def check_columns(attributes: Mapping[str, npt.NDArray[Any]], most: int, *, what: str) -> None:
+    """Raise UnsupportedCloud where `scalar_columns` and the axes are more columns than are read again."""
+    widths = {name: math.prod(values.shape[1:]) for name, values in attributes.items() if values.dtype.kind in "biuf"}
+    if (total := len(AXES) + sum(widths.values())) > most:
+        widest = max(widths, key=widths.__getitem__)
+        raise UnsupportedCloud(
+            f"x, y, z and the attributes are {total} columns, {widths[widest]} of them of {widest[:80]!r}; the limit "
+            f"of {what} is {most}: ask for another format"
+        )
 
 
 def meant(names: Collection[str], known: Collection[str]) -> dict[str, str]:

@@ -16,7 +16,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import RGB, in_8_bits, unpacked
 from straightpcf.points.formats.positions import AXES
-from straightpcf.points.formats.scalars import scalar_columns, with_intensity
+from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
 from straightpcf.points.formats.text import (
     Lines,
     as_integers,
@@ -107,12 +107,17 @@ class Xyz(Format):
         is_kept = isinstance(source, XyzSource) and self._has_layout(source.layout)
         return [] if is_kept else super().left_behind(cloud)
 
+    def check(self, cloud: PointCloud) -> None:
+        """Raise UnsupportedCloud where a new file has more columns than one may."""
+        if not self.is_counted and self._own(cloud) is None:  # a counted one has seven at most
+            check_columns(unpacked(cloud.attributes), MAX_COLUMNS, what=f"{self.name} tables")
+
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read with the moved positions replaced, or a new one if it is laid out otherwise."""
-        source = cloud.source
-        if isinstance(source, XyzSource) and (source.format == self.name or self._has_layout(source.layout)):
+        if (source := self._own(cloud)) is not None:
             path.write_bytes(replaced(source.raw, source.starts, source.ends, cloud.xyz, source.xyz))
         else:
+            self.check(cloud)
             path.write_bytes(self._new_file(cloud))
 
     def _new_file(self, cloud: PointCloud) -> bytes:
@@ -121,6 +126,12 @@ class Xyz(Format):
         separator = " " if self.delimiter is None else self.delimiter.decode()
         names = ("# " if self.delimiter is None else "") + separator.join(columns)
         return _lines([names] if len(columns) > 3 else [], columns, separator)
+
+    def _own(self, cloud: PointCloud) -> XyzSource | None:
+        """Return the file that was read, where it is written again."""
+        source = cloud.source
+        is_own = isinstance(source, XyzSource) and (source.format == self.name or self._has_layout(source.layout))
+        return source if is_own else None
 
     def _has_layout(self, layout: Layout) -> bool:
         return layout.delimiter == self.delimiter and (layout.declared is not None) == self.is_counted

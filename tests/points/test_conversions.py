@@ -90,6 +90,31 @@ def test_thousands_of_columns_whose_names_become_one_are_numbered_at_once() -> N
     assert [*columns] == ["field", "field_2", *(f"field_{number}" for number in range(4, 4098))]
 
 
+@pytest.mark.parametrize("target", ["ply", "pcd", "xyz", "csv", "tsv"])
+def test_what_has_more_columns_than_are_read_again_is_refused_before_it_is_filtered(
+    target: str, tmp_path: Path
+) -> None:
+    """One field of a PCD file may have any number, so may arrays with x, y, z; a file of 4096 columns is read again."""
+    format = format_named(target)
+    held = PointCloud(torus(5), {"id": np.arange(5), "shape": np.ones((5, 4092), np.float32)})
+    format.check(held)
+    assert len(converted(held, target, tmp_path).attributes) == 4093
+    wide = PointCloud(torus(5), {"id": np.arange(5), "shape": np.ones((5, 4093), np.float32)})
+    said = f"x, y, z and the attributes are 4097 columns, 4093 of them of 'shape'; the limit of {target}.* is 4096"
+    for refused in (lambda: format.check(wide), lambda: converted(wide, target, tmp_path)):
+        with pytest.raises(UnsupportedCloud, match=f"(?i){said}"):
+            refused()
+
+
+def test_a_wide_field_is_kept_by_its_own_format_and_left_behind_by_one_of_few_columns(tmp_path: Path) -> None:
+    head = "FIELDS x y z shape\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 5000\nWIDTH 1\nHEIGHT 1\nDATA binary\n"
+    (path := tmp_path / "wide.pcd").write_bytes(head.encode() + bytes(12 + 5000))
+    wide, _ = read_cloud(path)
+    moved = converted(wide.with_xyz(wide.xyz + 1), "pcd", tmp_path)
+    assert (moved.attributes["shape"].shape, moved.xyz.tolist()) == ((1, 5000), [[1, 1, 1]])
+    assert not converted(wide, "pts", tmp_path).attributes
+
+
 @pytest.mark.parametrize("target", ["las", "laz"])
 def test_columns_whose_names_las_has_no_room_for_are_named(target: str, tmp_path: Path) -> None:
     distance, half = "scalar_C2C_absolute_distances__X_", np.arange(3) + 0.5  # as CloudCompare calls them
