@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, TooManyPoints, UnsupportedCloud
 from straightpcf.points.formats import read_cloud
+from tests.effort import at_most_lines
 
 
 def read(folder: Path, raw: bytes, filename: str = "a.xyz", **options: Any) -> PointCloud:
@@ -149,10 +149,8 @@ def test_a_count_line_beyond_the_limit_is_refused(tmp_path: Path) -> None:
 def test_errors_far_down_a_long_file_are_found(tmp_path: Path) -> None:
     """Past the first block of the reader, so that line numbers add up across blocks."""
     raw = b"1.0 2.0 3.0\n" * 800_000
-    began = time.monotonic()
-    with pytest.raises(MalformedFile, match=r"line 800001, column 3.*oops"):
+    with at_most_lines(800_000), pytest.raises(MalformedFile, match=r"line 800001, column 3.*oops"):
         read(tmp_path, raw + b"1 2 oops\n")
-    assert time.monotonic() - began < 20
 
 
 @pytest.mark.parametrize("above", [b"", b"1 2 3\n"])
@@ -169,7 +167,5 @@ def test_one_endless_line_is_refused_before_it_takes_memory(above: bytes, tmp_pa
 @pytest.mark.parametrize("line", [b"#\n", b"\r"])
 def test_endless_lines_above_the_table_are_refused_before_they_take_time(line: bytes, tmp_path: Path) -> None:
     assert len(read(tmp_path, line * 99_999 + b"1 2 3\n")) == 1
-    began = time.monotonic()
-    with pytest.raises(UnsupportedCloud, match="first 100000 lines, the limit"):
+    with at_most_lines(5_000_000), pytest.raises(UnsupportedCloud, match="first 100000 lines, the limit"):
         read(tmp_path, line * 20_000_000 + b"1 2 3\n")
-    assert time.monotonic() - began < 10
