@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["PACKED", "RGB", "in_8_bits", "in_16_bits", "packed", "unpacked"]
+__all__ = ["PACKED", "RGB", "are_shares", "in_8_bits", "in_16_bits", "packed", "unpacked"]
 
 RGB = ("red", "green", "blue")
 PACKED = ("rgb", "rgba")  # PCL's: the bytes of a 32 bit number, 0xAARRGGBB, often called a float
@@ -75,6 +75,12 @@ def unpacked(attributes: _Attributes) -> dict[str, npt.NDArray[Any]]:
     return in_8_bits(attributes) if together else dict(attributes)
 
 
+def are_shares(numbers: npt.NDArray[np.float64]) -> bool:
+    """Say whether (N, 3) numbers are whole shares of 255, and can be nothing else: some are no fifths, as 0.2 is."""
+    shares = _shares(numbers)
+    return shares is not None and bool((shares % 51).any())
+
+
 def _colour(attributes: _Attributes) -> _Colour | None:
     """Find the colour; None where there is none, or not one alone."""
     called = {name.lower(): name for name in attributes}
@@ -97,7 +103,7 @@ def _colour(attributes: _Attributes) -> _Colour | None:
 
 
 def _whole(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any] | None:
-    """Return three columns of whole numbers as (N, 3) uint8 or, of larger ones, uint16."""
+    """Return three columns of whole numbers, or shares of 255, as (N, 3) uint8 or, of larger ones, uint16."""
     if not all(values.ndim == 1 and values.dtype.kind in "fiu" for values in columns):
         return None
     kinds = {values.dtype.newbyteorder("=") for values in columns}
@@ -106,7 +112,7 @@ def _whole(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any] | None:
     with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
         numbers = np.stack([values.astype(np.float64) for values in columns], axis=1)
     if not ((numbers >= 0) & (numbers < 2**16) & (numbers == np.rint(numbers))).all():
-        return None
+        return _shares(numbers) if are_shares(numbers) else None
     if numbers.max(initial=0) == 1 and any(kind.kind == "f" for kind in kinds):
         return None  # floats of 0 and 1 may as well be the whole range
     return numbers.astype(np.uint8 if (numbers < 256).all() else np.uint16)
@@ -117,9 +123,16 @@ def _of_array(values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
     if values.ndim != 2 or values.shape[1] != 3:
         return None
     if values.dtype.kind == "f" and ((values >= 0) & (values <= 1)).all():
-        shares = 255 * values.astype(np.float64)
-        return np.rint(shares).astype(np.uint8) if (np.abs(shares - np.rint(shares)) < _SAME).all() else None
+        return _shares(values.astype(np.float64))
     return _whole(list(values.T))
+
+
+def _shares(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8] | None:
+    """Return numbers from 0 to 1 that are whole shares of 255 as these."""
+    if not ((numbers >= 0) & (numbers <= 1)).all():
+        return None
+    shares = 255 * numbers
+    return np.rint(shares).astype(np.uint8) if (np.abs(shares - np.rint(shares)) < _SAME).all() else None
 
 
 def _of_packed(values: npt.NDArray[Any], others: dict[str, npt.NDArray[Any]]) -> _Colour:

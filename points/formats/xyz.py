@@ -14,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
-from straightpcf.points.formats.colours import RGB, in_8_bits, unpacked
+from straightpcf.points.formats.colours import RGB, are_shares, in_8_bits, unpacked
 from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
 from straightpcf.points.formats.text import (
@@ -33,6 +33,7 @@ __all__ = ["MAX_COLUMNS", "Csv", "Pts", "Tsv", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
 _COUNTED = 10  # points: of fewer, an x may go up by one each
+_SIX = tuple(f"column_{column + 1}" for column in range(6))
 _UNIT_ERROR = 1e-2  # of a normal's length, by the digits of a text
 _LOOKED_AT = 1 << 14  # bytes of the first rows, which tell decimal commas from cells
 # Three numbers or more, each of two cells between commas: 0,5, 1,5, 2,5.
@@ -96,7 +97,7 @@ class Xyz(Format):
             if len(starts) and all(raw[starts[0, axis] : ends[0, axis]].isdigit() for axis in (0, 1)):
                 _refuse_numbered(columns, layout.line)
         xyz = np.stack([columns.pop(axis) for axis in layout.axes], axis=1)
-        names = (*AXES, *NORMALS[0]) if _are_with_normals(layout, columns) else layout.names
+        names = _meant(columns) if layout.names == _SIX else layout.names
         attributes = {names[column]: values for column, values in columns.items()}
         source = XyzSource(self.name, layout, raw, starts, ends, xyz.copy())
         return PointCloud(xyz, attributes, source, beside=tuple(layout.names[column] for column in texts))
@@ -231,14 +232,21 @@ def _table(
     return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
 
 
-def _are_with_normals(layout: Layout, columns: Mapping[int, npt.NDArray[Any]]) -> bool:
-    """Say whether six columns without names are x y z nx ny nz, as in files of MeshLab and CGAL, and in `.xyzn`.
+def _meant(columns: Mapping[int, npt.NDArray[Any]]) -> tuple[str, ...]:
+    """Name six columns without names: x y z, and normals or a colour where the last three can be nothing else."""
+    if not {3, 4, 5} <= columns.keys():
+        return _SIX
+    behind = np.stack([columns[column].astype(np.float64) for column in (3, 4, 5)], axis=1)
+    if _are_normals(behind):
+        return *AXES, *NORMALS[0]
+    return (*AXES, *RGB) if are_shares(behind) else _SIX  # Open3D's .xyzrgb
+
+
+def _are_normals(normals: npt.NDArray[np.float64]) -> bool:
+    """Say whether (N, 3) numbers are normals, as in files of MeshLab and CGAL, and in `.xyzn`.
 
     Told by their length, of those that are not 0, and by a number below 0: colours of 0 to 1 have none.
     """
-    if layout.names != tuple(f"column_{column + 1}" for column in range(6)) or not {3, 4, 5} <= columns.keys():
-        return False
-    normals = np.stack([columns[axis].astype(np.float64) for axis in (3, 4, 5)], axis=1)
     with np.errstate(over="ignore"):
         lengths = np.sqrt((normals**2).sum(axis=1))
     lengths = lengths[~(lengths == 0)]

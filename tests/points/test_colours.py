@@ -30,6 +30,8 @@ SAID = {
     "LAS, high bytes only": three(BYTES.astype(np.uint16) << 8),
     "LAS, low bytes only": three(BYTES.astype(np.uint16)),
     "text": three(BYTES.astype(np.float64), ("R", "G", "B")),
+    "text of shares": three(BYTES / 255),
+    "shares in a PLY file": three((BYTES / 255).astype(np.float32)),
     "OpenSfM's": three(BYTES, ("diffuse_red", "diffuse_green", "diffuse_blue")),
     "PCL's rgb": {"rgb": WORDS.view("<f4")},
     "PCL's rgba": {"rgba": WORDS | np.uint32(0xFF000000)},
@@ -123,7 +125,8 @@ def test_alpha_is_kept_where_it_says_something() -> None:
     "said",
     [
         {"red": BYTES[:, 0], "green": BYTES[:, 1]},
-        three(BYTES / 255),
+        three(BYTES // 51 / 5),
+        three(BYTES / 255.5),
         three(BYTES // 255 * 1.0),
         three(-BYTES.astype(np.int32)),
         {"rgb": WORDS.astype(np.float64)},

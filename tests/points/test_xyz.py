@@ -12,6 +12,7 @@ import pytest
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnknownFormat
 from straightpcf.points.formats import format_for, format_named, read_cloud, text, write_cloud
+from straightpcf.points.formats.colours import RGB
 from tests.clouds import torus
 
 
@@ -306,6 +307,30 @@ def test_unit_vectors_behind_positions_are_normals(vectors: str, are_normals: bo
     if are_normals:
         write_cloud(cloud, out := tmp_path / "out.ply", format_for("out.ply"))
         np.testing.assert_array_equal(read_cloud(out)[0].old_normals(), cloud.old_normals())
+
+
+@pytest.mark.parametrize(
+    ("colours", "are_some"),
+    [
+        ("1 0 0.5019607843\n0 0.2 0.0039215686", True),  # 10 decimals, as Open3D writes them
+        ("1 0 0.501961\n0 0.2 0.003922", True),
+        ("1 0 0.2\n0 0.4 0.6", False),  # fifths may be anything
+        ("1 0 0\n0 1 1", False),
+        ("1 0 0.5\n0 0.2 0.0039215686", False),
+        ("1 0 0.5019607843\n0 0.2 nan", False),
+        ("1 0 0.5019607843\n0 0.2 red", False),
+    ],
+)
+def test_shares_of_255_behind_positions_are_colours(colours: str, are_some: bool, tmp_path: Path) -> None:
+    raw = "\n".join(f"{row}.5 {row} 2 {colour}" for row, colour in enumerate(colours.split("\n"))).encode()
+    cloud = read(tmp_path, raw, "a.xyzrgb")
+    assert (list(cloud.attributes) == ["red", "green", "blue"]) == are_some
+    assert written(tmp_path, cloud, "a.xyzrgb") == raw
+    if are_some:
+        write_cloud(cloud, out := tmp_path / "out.ply", format_for("out.ply"))
+        again = read_cloud(out)[0].attributes
+        np.testing.assert_array_equal(np.column_stack([again[name] for name in RGB]), [[255, 0, 128], [0, 51, 1]])
+        assert again["red"].dtype == np.uint8
 
 
 @pytest.mark.parametrize("name", ["a.xyzn", "a.xyzrgb", "a.TSV"])
