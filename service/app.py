@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import resource
 import signal
 import socket
 import sys
@@ -49,6 +50,13 @@ if TYPE_CHECKING:
     from straightpcf.service.api.grpc import GrpcServer
 
 __all__ = ["create_app", "serve"]
+
+# What no server can do without: its own files, a worker's pipes, some connections; and the database's -wal, which
+# SQLite lets grow to 4 MiB and more. With less it would be ready, and every job would fail, or none ever end.
+_LEAST = (
+    (resource.RLIMIT_NOFILE, 64, "may have {} files open (ulimit -n, LimitNOFILE)"),
+    (resource.RLIMIT_FSIZE, 2**24, "may make a file of {} bytes at most (ulimit -f, LimitFSIZE)"),
+)
 
 logger = logging.getLogger("uvicorn.error")
 
@@ -215,7 +223,11 @@ def _weights_name(settings: Settings) -> str:
 
 
 def _check_start(settings: Settings) -> None:
-    """Raise InvalidOptions for what would otherwise end the server in the middle of its start."""
+    """Raise InvalidOptions for what would otherwise end the server in the middle of its start, or keep it from work."""
+    for kind, least, told in _LEAST:
+        most, _ = resource.getrlimit(kind)
+        if most != resource.RLIM_INFINITY and most < least:
+            raise InvalidOptions(f"this process {told.format(most)}; a server needs {least}")
     try:
         with full_disk_as_spool_full():
             JobFolders(settings.data_dir).close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import sqlite3
 import subprocess
 import sys
@@ -45,6 +46,28 @@ def test_a_data_directory_that_cannot_be_used_is_said_in_a_line(tmp_path: Path, 
     assert done.returncode == 2
     assert f"data_dir is {tmp_path}, which cannot hold jobs: " in done.stderr.replace("\n", "")
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "most", "said"),
+    [
+        (resource.RLIMIT_NOFILE, 40, "may have 40 files open"),
+        (resource.RLIMIT_FSIZE, 300_000, "may make a file of 300000 bytes at most"),
+    ],
+)
+def test_limits_under_which_no_job_can_be_done_are_said_at_the_start(
+    tmp_path: Path, kind: int, most: int, said: str
+) -> None:
+    """With them it was ready, and its first jobs never ended."""
+    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
+    limit = f"resource.setrlimit({int(kind)}, ({most}, {most}))"
+    begin = f"import os, resource, sys; {limit}; os.execv(sys.argv[1], sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", begin, *command], env=clean_environment(), capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error [invalid_options]: this process {said}")
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_first_sweep_that_fails_is_made_up_for_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
