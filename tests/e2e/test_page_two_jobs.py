@@ -8,6 +8,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.conftest import RunningServer
 from tests.waiting import wait_for
 
@@ -18,6 +20,10 @@ HOLD_ONE = """() => {
     Worker.prototype.postMessage = post;
     window.held = () => this.postMessage(...said);
   };
+}"""
+HIDE = """(isHidden) => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => isHidden });
+  document.dispatchEvent(new Event("visibilitychange"));
 }"""
 
 
@@ -74,25 +80,32 @@ def test_a_list_that_comes_late_takes_no_newer_ones_place(page: Any, scan: Path)
     assert page.is_hidden("#jobs")
 
 
+@pytest.mark.parametrize(("others", "are_hidden"), [(3, False), (6, True)])
 def test_tabs_whose_jobs_wait_leave_connections_to_others_and_to_cancel(
-    page: Any, server: RunningServer, scan: Path
+    page: Any, server: RunningServer, scan: Path, others: int, are_hidden: bool
 ) -> None:
-    """Over HTTP/1.1 a browser has six to a server, for all of its tabs."""
+    """Over HTTP/1.1 a browser has six to a server, for all of its tabs; those that are not seen need none."""
     worker = server.worker_pid()
     os.kill(worker, signal.SIGSTOP)
     try:
         url = f"{server.url}/jobs?iterations=1"
         urllib.request.urlopen(urllib.request.Request(url, scan.read_bytes(), method="POST")).close()
         wait_for(lambda: b'"queued"' not in urllib.request.urlopen(f"{server.url}/jobs").read())  # it has the worker
-        tabs = [page, *(page.context.new_page() for _ in range(3))]
+        tabs = [page, *(page.context.new_page() for _ in range(others))]
         for tab in tabs:
             tab.goto(server.url)
             tab.select_option("#iterations", "1")
             tab.set_input_files("#file", scan)
             tab.click("#submit")
             tab.locator("#status", has_text="Waiting").wait_for()
+            if are_hidden and tab is not tabs[-1]:
+                tab.evaluate(HIDE, True)
+        if are_hidden:
+            with tabs[1].expect_request("**/events"):
+                tabs[1].evaluate(HIDE, False)
         tabs[-1].click("#cancel")
         tabs[-1].locator("#note", has_text="The job was canceled.").wait_for()
     finally:
         os.kill(worker, signal.SIGCONT)
     page.wait_for_selector("#report:not([hidden])")
+    assert page.is_visible("#legend")
