@@ -52,7 +52,7 @@ class AsyncClient:
         await self.aclose()
 
     async def aclose(self) -> None:
-        """Close the connections."""
+        """Close the connections; a `denoise` of another task ends, and its work on the server."""
         await self._transport.close()
 
     async def denoise(

@@ -60,7 +60,7 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close the connections; a `denoise` of another thread, once it notices, ends its work on the server."""
         self._transport.close()
 
     def denoise(

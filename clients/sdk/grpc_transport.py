@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Generator, Iterator
 from contextlib import aclosing, closing
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -42,6 +43,7 @@ class GrpcTransport(Transport):
     """Talk to the gRPC service."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.again = partial(type(self), url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.timeout, self.max_retries = timeout, max_retries
         self._url, self._key = url, api_key
         target, credentials = _target(url)
@@ -95,6 +97,7 @@ class AsyncGrpcTransport(AsyncTransport):
     """Talk to the gRPC service from a coroutine."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.again = partial(type(self), url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.timeout, self.max_retries = timeout, max_retries
         self._url, self._key = url, api_key
         self._channel: Any = None  # it belongs to the loop that makes the first call

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import AsyncGenerator, Iterator
+from functools import partial
 from typing import Any, TypeVar
 
 import httpx2
@@ -28,6 +29,7 @@ class HttpTransport(Transport):
     """Talk to the REST API."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.again = partial(type(self), url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.timeout, self.max_retries, self._url = timeout, max_retries, without_password(url)
         self._http = PerProcess(lambda: _made(httpx2.Client, url, api_key, timeout))
 
@@ -61,6 +63,7 @@ class AsyncHttpTransport(AsyncTransport):
     """Talk to the REST API from a coroutine."""
 
     def __init__(self, url: str, *, api_key: str | None, timeout: float | None, max_retries: int) -> None:
+        self.again = partial(type(self), url, api_key=api_key, timeout=timeout, max_retries=max_retries)
         self.timeout, self.max_retries, self._url = timeout, max_retries, without_password(url)
         self._http = _made(httpx2.AsyncClient, url, api_key, timeout)
 

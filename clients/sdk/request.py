@@ -63,8 +63,8 @@ class Call:
     request_id: names the request in the server's log, the same for every attempt.
     timeout: seconds of silence to bear, None for the client's own. silence: those to bear at least.
     events: the answer is a stream of events. may_wait: one that is held open with nothing to say is none that failed.
-    once: do not try again. until: give up then, on the monotonic clock.
-    written: when the body, a file, was written last (ns).
+    once: it is the last word of a flow: do not try again, but say it also where the client was closed meanwhile.
+    until: give up then, on the monotonic clock. written: when the body, a file, was written last (ns).
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]

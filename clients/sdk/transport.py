@@ -7,8 +7,8 @@ import math
 import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, Iterator
-from contextlib import aclosing
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import aclosing, closing
 from typing import TypeVar
 from urllib.parse import urlsplit, urlunsplit
 
@@ -175,7 +175,12 @@ class _Patience:
 
 
 class Transport(_Patience, ABC):
-    """Run flows in ordinary code; timeout: seconds of silence to bear, None for any."""
+    """Run flows in ordinary code; timeout: seconds of silence to bear, None for any.
+
+    again: makes another, for the last word of a flow under which this one was closed.
+    """
+
+    again: Callable[[], Transport]
 
     @abstractmethod
     def close(self) -> None:
@@ -187,6 +192,7 @@ class Transport(_Patience, ABC):
 
     def run(self, flow: Flow[_T]) -> _T:
         """Do what a flow asks for, request by request; return what it returns, raise what it raises."""
+        self.check_open()  # before it begins: it would say its last word of what it never asked for
         try:
             step = next(flow)
             while True:
@@ -202,6 +208,9 @@ class Transport(_Patience, ABC):
 
     def stream(self, step: Step) -> Iterator[None]:
         """Make one request until its receiver has it all, and yield whenever something came; raises its error."""
+        if self.closed and step[0].once:
+            yield from self._farewell(step)
+            return
         attempts = self.attempts(step)
         while True:
             self.check_open()
@@ -211,10 +220,16 @@ class Transport(_Patience, ABC):
                 return
             time.sleep(attempts.delay())
 
+    def _farewell(self, step: Step) -> Iterator[None]:
+        """Make the last request of a flow that a close has cut off: its job would run on for nobody."""
+        with closing(self.again()) as other:
+            yield from other.stream(step)
+
 
 class AsyncTransport(_Patience, ABC):
-    """Run flows in a coroutine; cancelling it ends the flow as an exception would."""
+    """Run flows in a coroutine; cancelling it ends the flow as an exception would. again: as of `Transport`."""
 
+    again: Callable[[], AsyncTransport]
     _loop: asyncio.AbstractEventLoop | None = None
 
     def check_open(self) -> None:
@@ -242,6 +257,7 @@ class AsyncTransport(_Patience, ABC):
         from anyio import CancelScope
         from anyio.lowlevel import checkpoint_if_cancelled
 
+        self.check_open()
         canceled = False
         try:
             step = next(flow)
@@ -263,6 +279,11 @@ class AsyncTransport(_Patience, ABC):
 
     async def stream(self, step: Step) -> AsyncGenerator[None]:
         """Do as `Transport.stream`."""
+        if self.closed and step[0].once:
+            async with aclosing(self._farewell(step)) as coming:
+                async for _ in coming:
+                    yield
+            return
         attempts = self.attempts(step)
         while True:
             self.check_open()
@@ -273,3 +294,12 @@ class AsyncTransport(_Patience, ABC):
                 self._has_answered = True
                 return
             await asyncio.sleep(attempts.delay())
+
+    async def _farewell(self, step: Step) -> AsyncGenerator[None]:
+        """Do as `Transport._farewell`."""
+        other = self.again()
+        try:
+            async for _ in other.stream(step):
+                yield
+        finally:
+            await other.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ import httpx2
 import pytest
 from anyio import CancelScope
 
-from straightpcf.clients.sdk import AsyncClient, AsyncJob, http_transport, request, retry
+from straightpcf.clients.sdk import AsyncClient, AsyncJob, Client, flows, http_transport, request, retry
 from straightpcf.points.errors import ConnectionFailed, InvalidRequest
 from tests.service.engines import until
 from tests.service.fakes import ObedientBackend
@@ -37,6 +37,38 @@ def test_calls_that_a_close_cuts_off_say_that_it_is_closed(monkeypatch: pytest.M
     with socket.create_server(("127.0.0.1", 0)) as silent:
         for scheme in ("http", "grpc"):
             asyncio.run(close_meanwhile(f"{scheme}://127.0.0.1:{silent.getsockname()[1]}"))
+
+
+def test_a_close_ends_on_the_server_what_it_cuts_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flows, "POLL_SECONDS", 0.2)  # after which a thread notices
+    (scan := tmp_path / "scan.xyz").write_text("0 0 0\n" * 50)
+
+    async def in_a_task(url: str, closing: Callable[[], Awaitable[object]]) -> None:
+        async with AsyncClient(url) as client:
+            call = asyncio.create_task(client.denoise(scan))
+            await closing()
+        with pytest.raises(InvalidRequest, match="closed"):
+            await call
+
+    async def in_a_thread(url: str, closing: Callable[[], Awaitable[object]]) -> None:
+        with Client(url) as client:
+            call = asyncio.create_task(asyncio.to_thread(client.denoise, scan))
+            await closing()
+        with pytest.raises(InvalidRequest, match="closed"):
+            await call
+
+    async def scenario() -> None:
+        backend = ObedientBackend()
+        backend.go.set()
+        async with serving(tmp_path / "data", backend, grpc_port=(grpc := free_port())) as (engine, host, http):
+            for url in (f"http://{host}:{http}", f"grpc://{host}:{grpc}"):
+                for use in (in_a_task, in_a_thread):
+                    backend.runs.clear()
+                    await use(url, lambda: until(lambda: backend.runs))
+                    assert not (await engine.list())[0]
+            assert len(backend.canceled) == 4
+
+    asyncio.run(asyncio.wait_for(scenario(), timeout=20))
 
 
 def test_a_client_in_another_event_loop_says_so() -> None:
