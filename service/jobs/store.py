@@ -38,7 +38,7 @@ from straightpcf.service.jobs.record import (
     ResultInfo,
 )
 from straightpcf.service.jobs.rows import event_of, record_of
-from straightpcf.service.jobs.turns import count_turn, next_row, positions
+from straightpcf.service.jobs.turns import BY_STATE, count_turn, next_row, positions
 
 __all__ = ["MAX_SERVER_DEATHS", "JobStore"]
 
@@ -121,7 +121,7 @@ class JobStore:
         if unknown := set(states) - set(STATES):
             raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
         states = set(states)  # SQLite takes only so many values
-        where, values = ["owner = ?"], [owner]
+        where, values = [f"{BY_STATE if states and states <= {*_ACTIVE} else 'owner'} = ?"], [owner]
         if states:
             where.append(f"state IN ({', '.join('?' * len(states))})")
             values += states
@@ -160,7 +160,8 @@ class JobStore:
     def load(self, owner: str | None = None) -> Load:
         """Sum up what waits and runs and what is kept, for one owner or for all."""
         where, values = ("", []) if owner is None else ("AND owner = ?", [owner])
-        query = f"SELECT COUNT(*), TOTAL(weight), TOTAL(spool - bytes) FROM jobs WHERE state IN {_ACTIVE} {where}"
+        active = where.replace("owner", BY_STATE)
+        query = f"SELECT COUNT(*), TOTAL(weight), TOTAL(spool - bytes) FROM jobs WHERE state IN {_ACTIVE} {active}"
         jobs, points, coming = self._db.execute(query, values).fetchone()
         query = f"SELECT TOTAL(spool) FROM jobs WHERE state <> 'expired' {where}"
         (kept,) = self._db.execute(query, values).fetchone()

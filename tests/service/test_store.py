@@ -197,6 +197,28 @@ def test_what_every_upload_asks_for_is_answered_by_an_index(tmp_path: Path) -> N
     assert all("INDEX" in plan for plan in plans), plans
 
 
+def test_what_uploads_and_waiting_jobs_ask_for_passes_over_all_that_is_over(tmp_path: Path) -> None:
+    with closing(JobStore(tmp_path / "jobs.sqlite3")) as store:
+        store._db.execute(
+            "WITH RECURSIVE over (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM over WHERE i < 3000) INSERT INTO jobs"
+            " (id, owner, folder, state, options, bytes, weight, created_at, digest)"
+            " SELECT i, '', i, 'expired', '{}', 1, 1, 0, i FROM over"
+        )
+        store.create(new_job("one", folder="one"))
+        steps = 0
+
+        def count() -> int:
+            nonlocal steps
+            steps += 1
+            return 0
+
+        store._db.set_progress_handler(count, 1)  # of SQLite's machine, of which a row takes several
+        assert store.load("").jobs == 1
+        assert store.get("one").position == 0
+        assert [job.id for job in store.page(owner="", states=("queued", "processing"))[0]] == ["one"]
+        assert steps < 3000
+
+
 def test_a_page_of_jobs_says_where_each_stands_in_the_queue(tmp_path: Path) -> None:
     with closing(JobStore(tmp_path / "jobs.sqlite3")) as store:
         for number in range(7):
