@@ -115,6 +115,12 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
                     self.transport.write(self.conn.send(event) or b"")
             self.transport.close()
 
+        def _unsupported_upgrade_warning(self) -> None:
+            """Warn of nothing: what would rather have HTTP/2 is answered all the same (RFC 9110, 7.8).
+
+            Java's client asks for it with every request, and the warning says to install WebSockets.
+            """
+
         def _be_patient(self) -> None:
             is_answering = self.cycle is not None and not self.cycle.response_complete
             if self.timeout_keep_alive_task is None and not is_answering:

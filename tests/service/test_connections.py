@@ -66,6 +66,21 @@ def test_what_is_no_http_is_told_so_by_a_problem(
     assert not [record for record in caplog.records if record.exc_info]
 
 
+@pytest.mark.parametrize("other", [b"h2c", b"websocket"])
+def test_one_that_would_rather_have_another_protocol_is_answered_and_fills_no_log(
+    tmp_path: Path, other: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(GOOD[:-2] + b"Connection: Upgrade, HTTP2-Settings, close\r\nUpgrade: " + other + b"\r\n\r\n")
+            assert (await asyncio.wait_for(reader.read(), timeout=10)).startswith(b"HTTP/1.1 200 ")
+            writer.close()
+
+    play(scenario)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
 @pytest.mark.parametrize("asked", [b"livez", b"jobs/a/events"])
 def test_what_comes_behind_an_answer_and_is_no_http_is_no_fault(
     tmp_path: Path, asked: bytes, caplog: pytest.LogCaptureFixture
