@@ -45,6 +45,7 @@ __all__ = ["MAX_SERVER_DEATHS", "JobStore"]
 MAX_SERVER_DEATHS = 6  # more than the runner's MAX_DEATHS of workers, for servers die of much else
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
+_USUAL: tuple[JobState, ...] = ("succeeded", "expired")  # what nearly all rows are
 _RELEASED = "state = 'queued', server = NULL, lease_until = NULL, progress = 0"
 _ENDED: tuple[JobState, ...] = tuple(sorted(FINISHED - {"expired"}))
 _DETAIL = 1000  # characters of what a job failed of that are kept: what a file says may be in it
@@ -121,7 +122,7 @@ class JobStore:
         if unknown := set(states) - set(STATES):
             raise InvalidRequest(f"state is {min(unknown)[:40]!r}; it must be one of {', '.join(STATES)}")
         states = set(states)  # SQLite takes only so many values
-        where, values = [f"{BY_STATE if states and states <= {*_ACTIVE} else 'owner'} = ?"], [owner]
+        where, values = [f"{BY_STATE if states and states.isdisjoint(_USUAL) else 'owner'} = ?"], [owner]
         if states:
             where.append(f"state IN ({', '.join('?' * len(states))})")
             values += states
