@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse, Response
 
 from straightpcf.points.errors import InvalidRequest
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
+from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 from straightpcf.service.api.auth import owner_of, owner_who_gives_back
 from straightpcf.service.api.download import open_result, result_response
 from straightpcf.service.api.events import NDJSON_MEDIA_TYPE, event_stream, last_event_id, patch_stream
@@ -186,4 +187,5 @@ async def job_stream(id: str, request: Request, owner: Owner) -> Response:
     accept = ",".join(request.headers.getlist("accept"))
     if len(accept) > 1000:
         raise InvalidRequest(f"Accept has {len(accept)} characters")
-    return patch_stream(engine, id, owner, as_json=asks_for(accept, NDJSON_MEDIA_TYPE))
+    as_json = asks_for(accept, NDJSON_MEDIA_TYPE, over=PATCHES_MEDIA_TYPE)
+    return patch_stream(engine, id, owner, as_json=as_json)

@@ -34,3 +34,18 @@ def test_only_what_was_heeded_is_said_to_be_applied(prefer: str, finished: bool,
 )  # fmt: skip
 def test_what_a_client_asks_for_is_read_as_rfc_9110_has_it(header: str, asked: bool) -> None:
     assert asks_for(header, "text/event-stream") is asked
+
+
+@pytest.mark.parametrize(
+    ("header", "asked"),
+    [
+        ("a/json, b/patches", True),
+        ("a/json;q=0.9, */*;q=0.1", True),
+        ("a/json;q=0.5, B/patches", False),
+        ("b/patches;q=0.4, a/json;q=0.5", True),
+        ("b/patches", False),
+        ("a/json;q=0, b/patches;q=0", False),
+    ],
+)
+def test_of_two_forms_the_one_with_more_weight_is_sent(header: str, asked: bool) -> None:
+    assert asks_for(header, "a/json", over="b/patches") is asked

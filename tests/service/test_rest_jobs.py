@@ -16,7 +16,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from straightpcf.points.wire.patches import PatchReader
+from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE, PatchReader
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, run_server
 from tests.service.rest import curl
@@ -107,6 +107,8 @@ def test_patches_add_up_to_the_result_in_both_forms(http: httpx2.Client) -> None
     result = np.load(io.BytesIO(http.get(job["links"]["result"]).content))
     assert np.array_equal(xyz, result)
     lines = http.get(job["links"]["stream"], headers={"Accept": "application/x-ndjson"}).text.splitlines()
+    either = {"Accept": "application/x-ndjson;q=0.5, application/vnd.straightpcf.patches"}
+    assert http.get(job["links"]["stream"], headers=either).headers["content-type"] == PATCHES_MEDIA_TYPE
     said = [json.loads(line) for line in lines]
     assert said[0] == {"points": 2500}
     assert said[-1] == {"end": True}
