@@ -172,10 +172,8 @@ def _runner(name: str, options: argparse.Namespace) -> Run:
         return Filtered(result.xyz, result.iterations)
 
     def run_every(cloud: Floats, _: float) -> Filtered:
-        states, distances, first = every_pass(model, cloud, seed=options.seed)
-        in_radii, thin_walls = first.noise_in_radii, first.sampling.thin_walls
-        recorded = Trace("", 0.0, distances, (), noise_in_radii=in_radii, thin_walls=thin_walls)
-        chosen = passes(model.calibration, recorded)
+        states, readings = every_pass(model, cloud, seed=options.seed)
+        chosen = passes(model.calibration, Trace.of(readings, (), cloud="", noise_std=0.0, noise_type=""))
         return Filtered(states[chosen], chosen, tuple(states[1:]))
 
     return run_every if options.every_pass else run

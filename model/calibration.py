@@ -11,18 +11,20 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["Calibration"]
+__all__ = ["DENSE_FROM_RADII", "Calibration"]
 
 # d of noise that one pass takes most of: hardly any, little, and what leaves more of thin bodies (1.5 to 2 %).
 _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
 # What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
 # a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
-_STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, _DENSE_FROM_RADII = 0.7, 8.0, 0.03
-# Of dense points two and three passes leave more of uniform noise and of noise along beams, which read as little: d of
-# 0.17 to 0.24, where one or two more are worth it. Of Gaussian noise 0.11 to 0.16 is left, and 0.19 of thin shapes.
-_LEFT_OF_DENSE = 0.17
+_STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, DENSE_FROM_RADII = 0.7, 8.0, 0.03
+# Of dense points two and three passes leave more of uniform noise and of noise along beams, which read as little. d is
+# as high of fins without noise: what tells is how thick the surface is beside how far apart its points are, and that
+# the last pass has made it thinner, or that it is so thick: of few points bends are as thick as a little noise.
+_LEFT_THICKNESS, _THINNED, _THICK = 0.03, 0.75, 0.3
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
+_FORMER = "crowded"  # a limit that older weights have: the thickness of the surface took its place
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,6 @@ class Calibration:
     polish, settled: equally long; where d was above polish[i] at the start, pass i + 2 is made all the same if d is
     below settled[i] by then. On thin and intricate shapes d stays higher when the noise is gone, and further passes
     pull their sides together.
-    crowded: noise at the start, in radii of a patch, above which a cloud that may get two passes may get a third: of
-    dense points the second leaves more than of few.
     stuck: where a second pass is due, but d after the first is more than this share of d at the start, walls close
     together were read, not noise, or rods, or what is left of shapes without any: further passes would join them.
     stirred: d above which noise is left whatever was done. most: passes in all.
@@ -48,7 +48,6 @@ class Calibration:
     starts: tuple[float, ...] = (0.76, 0.905)
     polish: tuple[float, ...] = (0.45, 0.76, 0.905)
     settled: tuple[float, ...] = (0.2, 0.2, 0.2)
-    crowded: float = 0.042
     stuck: float = 0.61
     stirred: float = 0.5
     most: int = 4
@@ -74,6 +73,7 @@ class Calibration:
             return cls()
         try:
             values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in entry.items()}
+            values.pop(_FORMER, None)
             return cls(**values)
         except (AttributeError, TypeError) as exc:
             raise MalformedFile(f"the weights' calibration does not fit: {exc}") from exc
@@ -97,12 +97,13 @@ class Calibration:
         *,
         thin_walls: bool = False,
         shown_walls: bool = False,
+        thicknesses: Sequence[float] = (),
     ) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
-        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, as `crowded`;
+        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, of a patch;
         thin_walls: whether points seemed to be on walls close together before the first pass; shown_walls: whether they
-        seem to be since, where strong noise hid them.
+        seem to be since, where strong noise hid them; thicknesses: of the surface (`Reading`), as many as distances.
         """
         done, start, now = len(distances) - 1, distances[0], distances[-1]
         due = max(1 + sum(start > limit for limit in self.starts), _PASSES_OF_SHOWN_WALLS if shown_walls else 1)
@@ -110,15 +111,21 @@ class Calibration:
         if not thin_walls:
             little = _LEAST_NOISE_DISTANCE <= start < _LITTLE_NOISE_DISTANCE
             stuck = stuck if little else max(stuck, _STUCK_WITHOUT_WALLS)
-            stuck += _STUCK_BY_RADIUS * max(0.0, noise_in_radii - _DENSE_FROM_RADII)
+            stuck += _STUCK_BY_RADIUS * max(0.0, noise_in_radii - DENSE_FROM_RADII)
         if done == 1 < due and start < _ONE_PASS_DISTANCE and now > stuck * start:
             return 0
         polished = 1 + sum(start > limit for limit in self.polish)
-        dense = polished == 2 and noise_in_radii > _DENSE_FROM_RADII and not thin_walls
-        left = dense and done >= 2 and now > _LEFT_OF_DENSE
-        if polished == 2 and noise_in_radii > self.crowded and len(self.polish) > 1:
-            polished = 3
+        dense = polished == 2 and noise_in_radii > DENSE_FROM_RADII and not thin_walls
         polishing = due <= done < polished and now < self.settled[done - 1]
+        left = dense and _has_left(thicknesses)
         if done >= self.most or not (done < due or polishing or left or now > self.stirred):
             return 0
         return 1 if done == self.most - 1 or (polishing and done == polished - 1 and not dense) else 2
+
+
+def _has_left(thicknesses: Sequence[float]) -> bool:
+    """Say of a surface after two passes and more whether the last one has left noise that another one takes."""
+    if len(thicknesses) <= 2:
+        return False
+    before, now = thicknesses[-2:]
+    return now > _THICK or _LEFT_THICKNESS < now < _THINNED * before

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.arrays import on_host
-from straightpcf.model.calibration import Calibration
+from straightpcf.model.calibration import DENSE_FROM_RADII, Calibration
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import (
     HIGH_NOISE,
+    is_dense_object,
     is_scene,
     noise_in_radii,
     parts_of,
@@ -51,6 +52,7 @@ _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is belie
 _SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
 _EXACT_PLANE_RATIO = 1e-3  # below it a plane is drawn, not scanned: of the noise beside it it says nothing
 _PLANE_FREEDOM = 3  # that a plane takes of its points
+_THICKNESS_NEIGHBOURS = 12
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
 # of how far they spread along it: the network sees noise in a tree, too.
 _FLAT_PATCH_STDS, _FLAT_RATIO = 1.3, 0.4
@@ -67,7 +69,8 @@ class Reading:
     what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
     scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud; probes: the patches that were read.
+    raster, None of any other cloud; probes: the patches that were read; thickness: of the surface that a pass has left
+    of dense points, the median of the std of each point's nearest across their plane by the lesser one along it.
     """
 
     distance: float
@@ -83,6 +86,7 @@ class Reading:
     uneven: bool = False
     height_axis: int | None = None
     probes: Patches | None = None
+    thickness: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,18 +128,24 @@ class NoiseReader:
         else:
             axis, scene = first.height_axis, first.scene
         if scene:
-            return self._read_scene(positions, tiling, probes, axis, first=first is None)
+            reading = self._read_scene(positions, tiling, probes, axis, first=first is None)
+            settled = first is not None or axis is not None or not self._zoom
+            if settled or not is_dense_object(reading.noise_std, probes.radii, len(positions)):
+                return reading
         scales = patch_scales(probes.radii, scene=False)
         distances = self._processor.distances(positions, probes, scales)
         distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
         noise = self._noise_std(distances, scales)
-        zoom, in_radii, high_noise, uneven = 1.0, 0.0, False, False
+        zoom, in_radii, high_noise, uneven, thickness = 1.0, 0.0, False, False, 0.0
         parts: tuple[int, ...] = (1,)
         if first is None:
             sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
             in_radii = noise_in_radii(noise, probes.radii)
         else:
             sampling = first.sampling
+            if first.noise_in_radii > DENSE_FROM_RADII:
+                thicknesses = self._processor.survey(positions, probes, _thicknesses)
+                thickness = float(np.median(np.concatenate(list(thicknesses))))
         if self._zoom:
             if first is None:
                 noise = self._reread(positions, tiling, noise)
@@ -162,6 +172,7 @@ class NoiseReader:
             high_noise=high_noise,
             uneven=uneven,
             probes=probes,
+            thickness=thickness,
         )
 
     def with_walls(self, positions: Floats, reading: Reading, first: Reading) -> Reading:
@@ -313,6 +324,13 @@ def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.boo
     least, less, most = np.sqrt(np.maximum(on_host(near.variances), 0.0) / (near.local.shape[1] - _PLANE_FREEDOM)).T
     is_plane = (least > _EXACT_PLANE_RATIO * less) & (least < _SEEN_PLANE_RATIO * less)
     return least, is_plane & (less > _SEEN_LINE_RATIO * most)
+
+
+def _thicknesses(nearest: Nearest, _patches: int) -> Floats:
+    """Return the std of each point's nearest across their plane by the lesser one along it: (n,)."""
+    across, along, _ = np.sqrt(np.maximum(on_host(nearest.first(_THICKNESS_NEIGHBOURS).variances), 0.0)).T
+    thicknesses: Floats = np.divide(across, along, out=np.zeros_like(across), where=along > 0)
+    return thicknesses
 
 
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:

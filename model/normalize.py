@@ -14,6 +14,7 @@ __all__ = [
     "LARGEST_RADIUS",
     "SMALLEST_RADIUS",
     "CloudFrame",
+    "is_dense_object",
     "is_scene",
     "noise_in_radii",
     "parts_of",
@@ -31,6 +32,9 @@ _MEDIAN_RADIUS = 0.25  # their median
 _FLAT_NOISE = 0.004  # the std that a flat patch's noise is brought to, within limits: see `zoom_of_flat`
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
+# Smaller ones may be those of an object with very many points, where nine tenths of them, taken evenly over the cloud,
+# are not so many times as large as one tenth: 1.03 to 1.72 of dense objects, 1.87 and more of scenes with such patches.
+_LEAST_OBJECT_RADIUS, _EVEN_RADII = 0.03, 1.8
 # In the first pass an object is shown in such a size that its noise has this std, within limits: see `zoom_of`.
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.03, 1.0
 _LARGEST_SHOWN_NOISE = 0.044  # more is brought to this, below the least factor, too
@@ -77,6 +81,18 @@ def is_scene(radius: float) -> bool:
     A street or a LiDAR frame has patches far smaller beside its bounding sphere than any in training.
     """
     return radius < _SCENE_RADIUS
+
+
+def is_dense_object(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> bool:
+    """Say of a cloud that `is_scene` takes for one whether it is an object all the same, to be filtered in parts.
+
+    noise_std, radii: in the unit ball, radii of some patches that lie evenly over it; count: of its points. They lie as
+    close all over an object, not in a scene. Where noise asks for no parts, what scenes have is as good for it
+    (docs/filter.md, "Parts").
+    """
+    low, high = np.quantile(radii, (0.1, 0.9))
+    is_even = low >= _LEAST_OBJECT_RADIUS and high < _EVEN_RADII * low
+    return bool(is_even) and parts_of(noise_std, radii, count) != (1,)
 
 
 def zoom_of(

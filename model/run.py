@@ -217,6 +217,7 @@ class Run:
             first.noise_in_radii,
             thin_walls=first.sampling.thin_walls,
             shown_walls=self._rounds > ROUNDS,
+            thicknesses=[reading.thickness for reading in self.readings],
         )
 
     def _spread_step(

@@ -28,7 +28,6 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
         (little, few, many, many)
         for little, few, many in product((0.18, 0.14), (0.18, 0.2, 0.22, 0.26, 0.3), (0.18, 0.2, 0.22, 0.26))
     ),
-    "crowded": (0.042, 1.0),
     "stuck": (0.61,),
     "stirred": (0.5,),
     "most": (5,),
@@ -44,7 +43,8 @@ class Trace:
     """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on.
 
     noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it;
-    noise_in_radii, thin_walls: of a patch, and of the cloud, what was read at the start.
+    noise_in_radii, thin_walls: of a patch, and of the cloud, what was read at the start; thicknesses: of the surface
+    before each pass and after the last, where it was read (`Reading`).
     """
 
     cloud: str
@@ -54,6 +54,24 @@ class Trace:
     noise_type: str = "gaussian"
     noise_in_radii: float = 0.0
     thin_walls: bool = False
+    thicknesses: tuple[float, ...] = ()
+
+    @classmethod
+    def of(
+        cls, readings: Sequence[Reading], chamfer: Sequence[float], *, cloud: str, noise_std: float, noise_type: str
+    ) -> Trace:
+        """Keep what was read before each pass and after the last, and CD from 0 passes on."""
+        first = readings[0]
+        return cls(
+            cloud,
+            noise_std,
+            tuple(reading.distance for reading in readings),
+            tuple(chamfer),
+            noise_type,
+            first.noise_in_radii,
+            first.sampling.thin_walls,
+            tuple(reading.thickness for reading in readings),
+        )
 
     @property
     def level(self) -> tuple[str, str, float]:
@@ -70,23 +88,23 @@ def trace(
     noise_type: str = "gaussian",
 ) -> Trace:
     """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
-    states, distances, first = every_pass(filter_, noisy)
-    chamfer = tuple(chamfer_distance(x, clean) for x in states)
-    return Trace(name, noise_std, distances, chamfer, noise_type, first.noise_in_radii, first.sampling.thin_walls)
+    states, readings = every_pass(filter_, noisy)
+    chamfer = [chamfer_distance(x, clean) for x in states]
+    return Trace.of(readings, chamfer, cloud=name, noise_std=noise_std, noise_type=noise_type)
 
 
 def every_pass(
     filter_: Filter, noisy: npt.NDArray[np.float64], *, seed: int = 0
-) -> tuple[list[npt.NDArray[np.float64]], tuple[float, ...], Reading]:
-    """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and what it goes by.
+) -> tuple[list[npt.NDArray[np.float64]], list[Reading]]:
+    """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and what it reads before each and last.
 
-    That is d before each pass and after the last, and the reading at the start. As many passes as `calibrate` knows of.
+    As many passes as `calibrate` knows of.
     """
     run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"]), seed=seed))
     states = {0: noisy}
     for patch in run.patches():
         states.setdefault(patch.iteration, noisy.copy())[patch.indices] = patch.xyz
-    return list(states.values()), run.distances, run.readings[0]
+    return list(states.values()), run.readings
 
 
 def noise_table(filter_: Filter, clouds: Mapping[str, npt.NDArray[np.float64]], *, seed: int = 0) -> Calibration:
@@ -139,8 +157,13 @@ def passes(calibration: Calibration, recorded: Trace) -> int:
     """Replay the rule of the filter on a recorded trace: how many passes `auto` would have made."""
     done = 0
     while done + 1 < len(recorded.distances):
-        so_far, thin_walls = recorded.distances[: done + 1], recorded.thin_walls
-        if not calibration.passes_left(so_far, recorded.noise_in_radii, thin_walls=thin_walls):
+        left = calibration.passes_left(
+            recorded.distances[: done + 1],
+            recorded.noise_in_radii,
+            thin_walls=recorded.thin_walls,
+            thicknesses=recorded.thicknesses[: done + 1],
+        )
+        if left == 0:
             break
         done += 1
     return done

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,15 +53,25 @@ def test_walls_that_a_pass_shows_get_four_passes() -> None:
 
 def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> None:
     distances = (0.58, 0.19, 0.12, 0.12, 0.12)
-    few, dense = Trace("few", 0.01, distances, ()), Trace("dense", 0.01, distances, (), noise_in_radii=0.06)
+    few, dense = (
+        Trace("cloud", 0.01, distances, (), noise_in_radii=radii, thicknesses=(0.0, 0.305, 0.043, 0.022, 0.02))
+        for radii in (0.02, 0.06)
+    )
     assert (passes(Calibration(), few), passes(Calibration(), dense)) == (2, 3)
+    bent = replace(dense, thicknesses=(0.0, 0.131, 0.105, 0.108, 0.109))  # few points, of which bends are as thick
+    assert passes(Calibration(), bent) == 2
     assert passes(Calibration(), Trace("thin", 0.01, (0.58, 0.3, 0.3), (), noise_in_radii=0.06)) == 1
     assert passes(Calibration(), Trace("clean", 0.0, (0.13, 0.12, 0.12), (), noise_in_radii=0.06)) == 1
-    assert passes(Calibration(crowded=1.0), dense) == 2
     distances = (0.55, 0.325, 0.202, 0.171, 0.142, 0.132)  # `special_cube`, 50K, uniform noise of 3 %
     fitted = Calibration(starts=(0.21, 0.75), polish=(0.35, 0.76), settled=(0.18, 0.3), most=5)
-    assert passes(fitted, Trace("uniform", 0.03, distances, (), noise_in_radii=0.046)) == 4
-    assert passes(fitted, Trace("few", 0.03, distances, (), noise_in_radii=0.02)) == 2
+    thicknesses = (0.0, 0.628, 0.394, 0.200, 0.049, 0.012)
+    thick = Trace("uniform", 0.03, distances, (), noise_in_radii=0.046, thicknesses=thicknesses)
+    assert passes(fitted, thick) == 5
+    assert passes(fitted, replace(thick, noise_in_radii=0.02)) == 2
+    fins = Trace(
+        "fins", 0.005, (0.41, 0.21, 0.19, 0.19), (), noise_in_radii=0.052, thicknesses=(0.0, 0.075, 0.020, 0.018)
+    )
+    assert passes(fitted, fins) == 2
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,33 @@ def test_noise_is_uneven_where_patches_differ_by_more_than_shape(
         assert not reading.known_distances  # they were shown in another size
 
 
+def ring(*, towards_one_side: float = 0.0) -> npt.NDArray[np.float64]:
+    """Return a thin torus of so many points that its patches are as small as a scene's; more of them on one side."""
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(0, 2 * np.pi, (2, 240_000))
+    kept = rng.uniform(0, 1 + towards_one_side, len(u)) < 1 + towards_one_side * np.cos(u)
+    u, v = u[kept][:100_000], v[kept][:100_000]
+    across = 0.95 + 0.05 * np.cos(v)
+    return np.stack([across * np.cos(u), across * np.sin(u), 0.05 * np.sin(v)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("noise", "towards_one_side", "scene"),
+    [(0.01, 0.0, False), (0.003, 0.0, True), (0.01, 0.9, True)],  # too little for parts; denser here than there
+)
+def test_an_object_of_very_many_points_is_no_scene_where_its_noise_asks_for_parts(
+    noise: float, towards_one_side: float, *, scene: bool
+) -> None:
+    xyz = ring(towards_one_side=towards_one_side)
+    positions = CloudFrame.of(xyz).enter(xyz)
+    reader = NoiseReader(SaysWhere(noise, noise, 0.0), _WIDE, tile, zoom=True)  # type: ignore[arg-type]
+    reading = reader.read(positions, tile(positions), None)
+    assert reading.scene is scene
+    assert (reading.parts != (1,)) is not scene
+    assert reading.noise_std == pytest.approx(noise)
+    assert reader.read(positions, tile(positions), reading).scene is scene  # with less noise, too
+
+
 def bent_and_flat() -> npt.NDArray[np.float64]:
     """Return a flat field beside a ball, far from the origin's other side, as a scene: noise of 0.02 across each."""
     rng = np.random.default_rng(0)
