@@ -28,7 +28,7 @@ _LIMITS: dict[str, tuple[Any, ...]] = {
         (little, few, many, many)
         for little, few, many in product((0.18, 0.14), (0.18, 0.2, 0.22, 0.26, 0.3), (0.18, 0.2, 0.22, 0.26))
     ),
-    "stuck": (0.61,),
+    "stuck": (0.61, 0.64),
     "stirred": (0.5,),
     "most": (5,),
 }
