@@ -80,7 +80,10 @@ def test_a_list_that_comes_late_takes_no_newer_ones_place(page: Any, scan: Path)
     assert page.is_hidden("#jobs")
 
 
-@pytest.mark.parametrize(("others", "are_hidden"), [(3, False), (6, True)])
+@pytest.mark.parametrize(
+    ("others", "are_hidden"),
+    [(3, False), pytest.param(6, True, marks=pytest.mark.slow)],  # seven pages
+)
 def test_tabs_whose_jobs_wait_leave_connections_to_others_and_to_cancel(
     page: Any, server: RunningServer, scan: Path, others: int, are_hidden: bool
 ) -> None:
