@@ -144,7 +144,7 @@ class NoiseReader:
         else:
             sampling = first.sampling
             if first.noise_in_radii > DENSE_FROM_RADII:
-                thicknesses = self._processor.survey(positions, probes, _thicknesses)
+                thicknesses = self._processor.survey(positions, probes, _thickness_ratios)
                 thickness = float(np.median(np.concatenate(list(thicknesses))))
         if self._zoom:
             if first is None:
@@ -326,11 +326,11 @@ def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.boo
     return least, is_plane & (less > _SEEN_LINE_RATIO * most)
 
 
-def _thicknesses(nearest: Nearest, _patches: int) -> Floats:
+def _thickness_ratios(nearest: Nearest, _patches: int) -> Floats:
     """Return the std of each point's nearest across their plane by the lesser one along it: (n,)."""
     across, along, _ = np.sqrt(np.maximum(on_host(nearest.first(_THICKNESS_NEIGHBOURS).variances), 0.0)).T
-    thicknesses: Floats = np.divide(across, along, out=np.zeros_like(across), where=along > 0)
-    return thicknesses
+    ratios: Floats = np.divide(across, along, out=np.zeros_like(across), where=along > 0)
+    return ratios
 
 
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:

@@ -88,7 +88,7 @@ def is_dense_object(noise_std: float, radii: npt.NDArray[np.float64], count: int
 
     noise_std, radii: in the unit ball, radii of some patches that lie evenly over it; count: of its points. They lie as
     close all over an object, not in a scene. Where noise asks for no parts, what scenes have is as good for it
-    (docs/filter.md, "Parts").
+    (docs/filter.md, "The size in which a patch is shown").
     """
     low, high = np.quantile(radii, (0.1, 0.9))
     is_even = low >= _LEAST_OBJECT_RADIUS and high < _EVEN_RADII * low

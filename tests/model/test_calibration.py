@@ -150,6 +150,8 @@ def test_a_pass_that_makes_a_cloud_worse_than_its_input_costs_most() -> None:
 def test_a_calibration_survives_its_metadata_and_a_broken_one_is_refused() -> None:
     calibration = calibrate([trace(0.0, 0.1, 0.1), trace(0.01, 0.6, 0.1)])
     assert Calibration.from_metadata(calibration.to_metadata()) == calibration
+    older = {**calibration.to_metadata()["calibration"], "crowded": 0.042}
+    assert Calibration.from_metadata({"calibration": older}) == calibration
     for broken in (
         {"polished": 0.2},
         {"distances": [0.5, 0.4], "noise": [0.0, 0.1]},
