@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
+from inspect import unwrap
 
 import torch
 
@@ -21,6 +22,12 @@ class SOAP(torch.optim.Optimizer):
     `step` has no host-side condition, so a CUDA graph can hold it; `turn_bases` is called beside it, every few steps.
     The learning rate may be a tensor. Every value of the state is a tensor.
     """
+
+    # As torch wraps them, these import its compiler, to tell it to pass them by: seconds, where nothing is compiled.
+    add_param_group = unwrap(torch.optim.Optimizer.add_param_group)
+    zero_grad = unwrap(torch.optim.Optimizer.zero_grad)
+    state_dict = unwrap(torch.optim.Optimizer.state_dict)
+    load_state_dict = unwrap(torch.optim.Optimizer.load_state_dict)
 
     def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: float | torch.Tensor = 1e-3) -> None:
         super().__init__(parameters, {"lr": lr, "capturable": True})  # so that a loaded "step" is on its device
