@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
 
@@ -145,6 +146,22 @@ class Filter:
         else:
             self.processor = OnDevice(self, device, threads=self.threads)
         keep_large_buffers()
+
+    @contextmanager
+    def heeding(self, heed: Callable[[], None]) -> Iterator[None]:
+        """Call `heed` again and again in here, also before a first patch is settled; what it raises ends the work.
+
+        On a CPU, where a cloud's noise takes a second to read; on a device it is never called.
+        """
+        host = self.processor if isinstance(self.processor, OnHost) else None
+        if host is None:
+            yield
+            return
+        host.heed = heed
+        try:
+            yield
+        finally:
+            host.heed = None
 
     def begin(self, x: torch.Tensor) -> torch.Tensor:
         """Return the velocities (B, P, 3) of a pass's first evaluation of patches (B, P, 3) float32."""

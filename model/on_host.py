@@ -32,10 +32,11 @@ class OnHost:
         self._network, self._threads = network, threads
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
+        self.heed: Callable[[], None] | None = None  # called again and again while there is work; see `Filter.heeding`
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the threads behind where a filter is handed to another process, or copied."""
-        return {**self.__dict__, "_pool": None}
+        return {**self.__dict__, "_pool": None, "heed": None}
 
     def displacements(
         self, positions: Floats, cut: Patches, scales: Floats, known_distances: Mapping[int, float], finish: Finish[_T],
@@ -105,12 +106,18 @@ class OnHost:
             for item in items:
                 waiting.append(pool.submit(_inference, function, item))
                 if len(waiting) >= 2 * self._threads:
-                    yield waiting.popleft().result()
+                    yield self._awaited(waiting.popleft())
             while waiting:
-                yield waiting.popleft().result()
+                yield self._awaited(waiting.popleft())
         finally:
             for future in waiting:
                 future.cancel()
+
+    def _awaited(self, coming: Future[_T]) -> _T:
+        result = coming.result()
+        if self.heed is not None:
+            self.heed()
+        return result
 
     def _own_pool(self) -> ThreadPoolExecutor:
         """Return the threads of this process: a fork has none of its parent's."""

@@ -33,10 +33,16 @@ OnPreview = Callable[[int, list[int], list[list[float]]], None]
 
 
 def denoise_file(
-    denoiser: Filter, job: FileJob, *, on_progress: OnProgress | None = None, on_preview: OnPreview | None = None
+    denoiser: Filter,
+    job: FileJob,
+    *,
+    on_progress: OnProgress | None = None,
+    on_preview: OnPreview | None = None,
+    heed: Callable[[], None] | None = None,
 ) -> FileReport:
     """Read, denoise and write; raises StraightPCFError, and whatever on_progress raises to stop the work.
 
+    heed: called more often than that, and may raise as well (`Filter.heeding`).
     The target is on the disk, not only in its cache, when this returns.
     """
     from straightpcf.model.filter import Run
@@ -52,8 +58,10 @@ def denoise_file(
         on_progress(0.0, 0)
     was_read = time.monotonic()
     run = Run(denoiser, cloud.xyz, job.options)
-    with ExitStack() as open_files:
-        patches = None if job.patches is None else open_files.enter_context(_PatchFile(job.patches))
+    with ExitStack() as opened:
+        if heed is not None:
+            opened.enter_context(denoiser.heeding(heed))
+        patches = None if job.patches is None else opened.enter_context(_PatchFile(job.patches))
         if patches is not None:
             patches.write(encode_header(len(cloud)))
         preview = _Preview(len(cloud), on_preview)

@@ -156,14 +156,17 @@ def _load(spec: WorkerSpec) -> Filter:
 def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed | Unusable:
     sent, last_iteration = 0.0, 0
 
-    def on_progress(fraction: float, iteration: int) -> None:
-        nonlocal sent, last_iteration
+    def heed() -> None:
         while pipe.poll():
             message = pipe.recv()
             if message is None:
                 raise EOFError("the server ends this worker")
             if message == Cancel(job.id):
                 raise JobCanceled(f"job {job.id} was canceled")
+
+    def on_progress(fraction: float, iteration: int) -> None:
+        nonlocal sent, last_iteration
+        heed()
         if (now := time.monotonic()) - sent >= PROGRESS_INTERVAL_SECONDS or iteration != last_iteration:
             sent, last_iteration = now, iteration
             pipe.send(Progress(job.id, fraction, iteration))
@@ -173,7 +176,8 @@ def _answer(denoiser: Filter, job: FileJob, pipe: Connection) -> Done | Failed |
 
     try:
         with full_disk_as_spool_full():
-            return Done(job.id, denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview))
+            report = denoise_file(denoiser, job, on_progress=on_progress, on_preview=on_preview, heed=heed)
+            return Done(job.id, report)
     except (EOFError, BrokenPipeError):
         raise
     except StraightPCFError as error:
