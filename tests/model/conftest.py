@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from straightpcf.model.train import loop
 from tests.clouds import sphere, torus
 
 
@@ -16,3 +18,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     clouds = {f"shape{i:02d}/2000": (torus(2000, i) if i % 2 else sphere(2000, i)) for i in range(11)}
     np.savez(path, **{name: cloud.astype(np.float32) for name, cloud in clouds.items()})
     return path
+
+
+@pytest.fixture(scope="module")
+def few_to_validate_with() -> Iterator[None]:
+    """Runs of a few iterations would take most of their time for the validation at their end: two batches will do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "_VALIDATION_PATCHES", 16)
+        yield

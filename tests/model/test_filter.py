@@ -253,6 +253,17 @@ def test_an_exception_from_the_progress_callback_ends_the_work(tiny: Filter) -> 
     assert len(seen) == 3
 
 
+def test_work_can_be_ended_before_a_first_patch_is_settled(tiny: Filter) -> None:
+    cloud = noisy(torus(1200), 0.01)
+
+    def stop() -> None:
+        raise JobCanceled("enough")
+
+    with tiny.heeding(stop), pytest.raises(JobCanceled):
+        next(tiny.patches(cloud, ONE_PASS))
+    assert tiny.denoise(cloud, ONE_PASS).iterations == 1  # it is heeded no more
+
+
 @pytest.mark.parametrize(("iterations", "passes_left"), [(3, None), ("auto", [2, 2, 0]), ("auto", [2, 2, 2, 1, 0])])
 def test_progress_never_falls_and_ends_at_one(
     tiny: Filter, monkeypatch: pytest.MonkeyPatch, iterations: Any, passes_left: list[int] | None
@@ -284,7 +295,7 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
 
 
 def test_a_part_with_more_noise_is_filtered_like_a_cloud_with_as_much(shipped: Filter) -> None:
-    clean = torus(8000)
+    clean = torus(4000)
     loud = clean[:, 0] > 0.3
     noise = np.random.default_rng(1).standard_normal(clean.shape)
     left = [
@@ -297,7 +308,7 @@ def test_a_part_with_more_noise_is_filtered_like_a_cloud_with_as_much(shipped: F
 
 @pytest.mark.parametrize("noise", [0.03, 0.05, 0.08])
 def test_more_noise_than_any_in_training_is_read_and_taken_away(shipped: Filter, noise: float) -> None:
-    cloud = noisy(torus(8000), noise)
+    cloud = noisy(torus(4000), noise)
     result = shipped.denoise(cloud, DenoiseOptions(iterations=2))
     before, after = (np.square(distance_to_torus(x)).mean() for x in (cloud, result.xyz))
     assert result.noise_before == pytest.approx(noise, rel=0.35)

@@ -40,9 +40,14 @@ def network() -> StraightPCF:
 
 
 def on_device(
-    network: torch.nn.Module, *, batch: int = 4, capture: Capture = capture_by_calling, tile_points: int | None = None
+    network: torch.nn.Module,
+    *,
+    batch: int = 4,
+    capture: Capture = capture_by_calling,
+    coverage: float = 3,
+    tile_points: int | None = None,
 ) -> Filter:
-    model = Filter(network, threads=1, coverage=3, tile_points=tile_points)  # type: ignore[arg-type]
+    model = Filter(network, threads=1, coverage=coverage, tile_points=tile_points)  # type: ignore[arg-type]
     model.processor = OnDevice(model, "cpu", batch=batch, capture=capture)
     return model
 
@@ -62,8 +67,8 @@ def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) ->
 def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
     cloud = noisy(torus(11_000), 0.01)
     options = DenoiseOptions(iterations=2)
-    expected = Filter(network, threads=1, coverage=3, tile_points=10_000).denoise(cloud, options)
-    result = on_device(network, batch=16, tile_points=10_000).denoise(cloud, options)
+    expected = Filter(network, threads=1, coverage=2, tile_points=10_000).denoise(cloud, options)
+    result = on_device(network, batch=16, coverage=2, tile_points=10_000).denoise(cloud, options)
     apart = np.linalg.norm(result.xyz - expected.xyz, axis=1)
     assert (apart < 1e-4).mean() > 0.98
 

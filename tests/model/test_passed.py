@@ -143,6 +143,7 @@ def test_errors_along_the_surface_hardly_count_there(data: Path) -> None:
     np.testing.assert_allclose(torch.linalg.eigvalsh(found[1]), np.tile([0.02, 0.02, 1], (PATCH_SIZE, 1)), atol=1e-4)
 
 
+@pytest.mark.usefixtures("few_to_validate_with")
 def test_a_run_takes_them_and_its_team_too(passed: Path, data: Path, tmp_path: Path) -> None:
     first = train("vm", data=data, run_dir=tmp_path / "vm", iterations=1, batch_size=2, threads=1)
     wanted = {"data": data, "iterations": 2, "batch_size": 2, "threads": 1, "init": first}

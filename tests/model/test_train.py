@@ -25,6 +25,8 @@ from straightpcf.model.train.team import Team
 from straightpcf.model.turns import turns
 from straightpcf.points.errors import InvalidOptions, MalformedFile
 
+pytestmark = pytest.mark.usefixtures("few_to_validate_with")
+
 
 @pytest.fixture(scope="module")
 def velocity_run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -49,6 +51,15 @@ def test_an_optimiser_loaded_counts_its_steps_where_the_parameters_are() -> None
     other = SOAP([there])
     other.load_state_dict(optimiser.state_dict())
     assert other.state[there]["step"].device == there.device
+
+
+def test_an_optimiser_does_without_torchs_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # to import it takes seconds, and is refused now
+    (parameter := torch.nn.Parameter(torch.zeros(4, 4))).grad = torch.ones(4, 4)
+    (optimiser := SOAP([parameter])).step()
+    optimiser.zero_grad()
+    optimiser.load_state_dict(optimiser.state_dict())
+    assert parameter.grad is None
 
 
 def test_soap_finds_the_axes_of_an_ill_conditioned_problem() -> None:
