@@ -20,6 +20,8 @@ from pathlib import Path
 import httpcore2
 import pytest
 
+from tests.warm import SERVER, run_warm
+
 START_SECONDS = 60.0
 
 
@@ -109,6 +111,13 @@ def run_server(
             process.kill()
             process.wait()
             raise
+
+
+def serve(*arguments: object, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a server that ends by itself, since it cannot start."""
+    settings, command = clean_environment() | dict(environment or {}), ("serve", "--port", "0", *arguments)
+    done = run_warm("straightpcf.clients.cli", *command, environment=settings, loaded=SERVER)
+    return subprocess.CompletedProcess(done.args, done.returncode, done.stdout.decode(), done.stderr.decode())
 
 
 def clean_environment() -> dict[str, str]:

@@ -18,26 +18,37 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["MODEL", "SDK", "run_warm"]
+__all__ = ["MODEL", "SDK", "SERVER", "run_warm"]
 
 ROOT = Path(__file__).parent.parent
 SECONDS = 120
 # What commands import, but no command itself: it runs as __main__, as by `python -m`.
 SDK = ("rich.progress", "straightpcf.clients.sdk", "straightpcf.points.formats", "typer")
-MODEL = (*SDK, "scipy.spatial", "straightpcf.model.filter")
+MODEL = (*SDK, "scipy.spatial", "straightpcf.model.train.loop")
+SERVER = (*SDK, "straightpcf.service.app", "uvicorn")  # and no torch, which a server leaves to its workers
 
 
 def run_warm(
-    module: str, *arguments: object, environment: Mapping[str, str], stdin: bytes = b"", loaded: tuple[str, ...] = MODEL
+    module: str,
+    *arguments: object,
+    environment: Mapping[str, str],
+    stdin: bytes = b"",
+    stdout: int | None = None,
+    stderr: int | None = None,
+    loaded: tuple[str, ...] = MODEL,
 ) -> subprocess.CompletedProcess[bytes]:
     """Do as `python -m module` does from the root of the repository, with pipes; after SECONDS it is killed.
 
-    loaded: what is there already; a process that has loaded torch takes longer to begin and to end.
+    stdout, stderr: the numbers of open files to write to instead of pipes that are read. loaded: what is there already;
+    a process that has loaded torch takes longer to begin and to end.
     """
     words = [str(argument) for argument in arguments]
     asked = json.dumps([module, words, dict(environment)]).encode()
     pipes, forker = [os.pipe() for _ in range(3)], _forker(loaded)
     theirs, ours = [pipes[0][0], pipes[1][1], pipes[2][1]], [pipes[0][1], pipes[1][0], pipes[2][0]]
+    for pipe, other in zip(theirs[1:], (stdout, stderr), strict=True):
+        if other is not None:
+            os.dup2(other, pipe)
     socket.send_fds(forker, [len(asked).to_bytes(4, "big")], theirs)
     forker.sendall(asked)
     for pipe in theirs:

@@ -30,7 +30,7 @@ from straightpcf.points.errors import (
 from straightpcf.service.backends import worker
 from straightpcf.service.backends.worker import WorkerSpec
 from tests.clouds import noisy, sphere, torus
-from tests.conftest import clean_environment
+from tests.conftest import clean_environment, serve
 from tests.warm import run_warm
 
 POINTS = 400
@@ -135,7 +135,7 @@ def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> N
 
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
-    done = cold_cli("serve", "--port", "0", "--device", "cuda", "--data-dir", tmp_path)
+    done = serve("--device", "cuda", "--data-dir", tmp_path)
     assert done.returncode == 4
     assert "error [device_unavailable]" in done.stderr
     assert "Traceback" not in done.stderr
@@ -144,7 +144,7 @@ def test_serve_ends_with_exit_4_where_its_device_is_missing(tmp_path: Path) -> N
 
 def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
     (taken := tmp_path / "file").write_bytes(b"")  # no folder: the server ends as soon as it has warned
-    done = cold_cli("serve", "--host", "0.0.0.0", "--port", "0", "--data-dir", taken / "data")
+    done = serve("--host", "0.0.0.0", "--data-dir", taken / "data")
     assert "NO API KEYS ARE SET and this server listens on 0.0.0.0" in done.stderr
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     assert "data_dir" in done.stderr.splitlines()[-1]
@@ -154,7 +154,7 @@ def test_serve_warns_when_others_can_reach_it(tmp_path: Path) -> None:
 def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-        done = cold_cli("serve", "--port", "0", option, str(port), "--device", "cpu", "--data-dir", tmp_path)
+        done = serve(option, port, "--device", "cpu", "--data-dir", tmp_path)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith(f"error [invalid_options]: {option[2:].replace('-', '_')} is {port}")
     assert "Started server process" not in done.stderr
@@ -162,7 +162,7 @@ def test_serve_says_that_its_port_is_taken_before_it_starts_anything(option: str
 
 @pytest.mark.parametrize("host", ["no.such.host", "192.0.2.1", ".."])  # no name, another machine's, none at all
 def test_serve_says_that_its_host_is_none_of_this_machine_before_it_starts_anything(host: str, tmp_path: Path) -> None:
-    done = cold_cli("serve", "--host", host, "--port", "0", "--grpc-port", "0", "--data-dir", tmp_path)
+    done = serve("--host", host, "--grpc-port", "0", "--data-dir", tmp_path)
     assert done.returncode == 2
     assert f"host is {host!r}, where this machine cannot listen: " in done.stderr.replace("\n", "")
     assert "Started server process" not in done.stderr
@@ -253,35 +253,15 @@ def test_train_runs_a_stage_and_goes_on_where_it_stopped(tmp_path: Path) -> None
 def test_an_interrupted_training_saves_what_it_has_and_says_so(processes: int, tmp_path: Path) -> None:
     data, run = tmp_path / "shapes.npz", tmp_path / "run"
     np.savez(data, **{f"shape{i:02d}/1000": torus(1000, i).astype(np.float32) for i in range(6)})
-    command = [sys.executable, "-c", _INTERRUPTED_TRAINING, "train", "vm", "--data", data, "--run-dir", run]
-    command += ["--batch-size", "2", "--rows", "16", "--threads", "1", "--processes", str(processes)]
-    done = subprocess.run(  # a group of its own, which the signal goes to, as a terminal's
-        command, capture_output=True, text=True, check=False, env=clean_environment(), timeout=120,
-        start_new_session=True,
+    options = ("--batch-size", 2, "--rows", 16, "--threads", 1, "--processes", processes)
+    done = run_warm(
+        "tests.clients.interrupted_training", "train", "vm", "--data", data, "--run-dir", run, *options,
+        environment=clean_environment(),
     )  # fmt: skip
-    assert (done.returncode, done.stdout) == (130, ""), done.stderr
-    assert done.stderr == "stopped after iteration 2 of 20000; the same command goes on from there\n"
+    assert (done.returncode, done.stdout) == (130, b""), done.stderr
+    assert done.stderr == b"stopped after iteration 2 of 20000; the same command goes on from there\n"
     assert (run / "log.csv").read_text().splitlines()[1].startswith("vm,2,")
     assert (run / "state.safetensors").is_file()
-
-
-_INTERRUPTED_TRAINING = """
-import os, signal
-from straightpcf.clients.cli import main
-from straightpcf.model.train import loop
-
-def interrupted(stage, *, on_step, **wanted):
-    def step(done):
-        on_step(done)
-        if done.iteration == 1:
-            os.killpg(0, signal.SIGTERM)
-    return loop.train(stage, on_step=step, **wanted)
-
-if __name__ == "__main__":
-    import straightpcf.model.train
-    straightpcf.model.train.train = interrupted
-    main()
-"""
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import urllib.request
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import pytest
 from straightpcf.points.errors import InvalidOptions
 from straightpcf.service.app import create_app
 from straightpcf.service.settings import Settings
-from tests.conftest import clean_environment, run_server
+from tests.conftest import run_server, serve
 from tests.service.fakes import ObedientBackend
 
 # What a pod is told of the Services straightpcf and straightpcf-grpc in its namespace.
@@ -142,9 +140,7 @@ def test_keys_that_are_set_but_hold_none_open_no_server(value: str, tmp_path: Pa
 def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_weights(
     name: str, value: str, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
-    environment = clean_environment() | {f"STRAIGHTPCF_{name}": value}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    done = serve("--data-dir", tmp_path, environment={f"STRAIGHTPCF_{name}": value})
     assert done.returncode == 2
     assert name.lower() in done.stderr
     assert "Started server process" not in done.stderr

@@ -18,7 +18,7 @@ import pytest
 from straightpcf.points.errors import SpoolFull
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.store import JobStore
-from tests.conftest import clean_environment, run_server
+from tests.conftest import clean_environment, run_server, serve
 from tests.service.engines import play, submit
 from tests.service.fakes import ObedientBackend
 
@@ -41,8 +41,7 @@ def _put_a_file_where_jobs_go(folder: Path) -> None:
 @pytest.mark.parametrize("spoil", [_damage, _put_a_file_where_jobs_go])
 def test_a_data_directory_that_cannot_be_used_is_said_in_a_line(tmp_path: Path, spoil: Callable[[Path], None]) -> None:
     spoil(tmp_path)
-    command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
-    done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60)
+    done = serve("--data-dir", tmp_path)
     assert done.returncode == 2
     assert f"data_dir is {tmp_path}, which cannot hold jobs: " in done.stderr.replace("\n", "")
     assert "Traceback" not in done.stderr
@@ -131,8 +130,7 @@ def test_nobody_else_may_read_what_a_server_makes_in_folders_that_were_there(tmp
 def test_folders_on_two_disks_are_refused_at_the_start(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm") as other:
         (tmp_path / "jobs").symlink_to(other)
-        command = [sys.executable, "-m", "straightpcf.clients.cli", "serve", "--port", "0", "--data-dir", str(tmp_path)]
-        done = subprocess.run(command, env=clean_environment(), capture_output=True, text=True, timeout=60)
+        done = serve("--data-dir", tmp_path)
         assert done.returncode == 2
         assert f"{tmp_path}/jobs and {tmp_path}/incoming are not on one disk" in done.stderr
         assert "Traceback" not in done.stderr
