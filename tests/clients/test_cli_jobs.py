@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -23,12 +22,22 @@ from tests.waiting import wait_for
 from tests.warm import MODEL, SDK, run_warm
 
 POINTS = 400
+LARGE = 12_000  # ten passes over so many points take many seconds
 
 
-def cli(server: RunningServer | None, *arguments: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+def cli(
+    server: RunningServer | None,
+    *arguments: object,
+    stdin: bytes = b"",
+    stdout: int | None = None,
+    stderr: int | None = None,
+) -> subprocess.CompletedProcess[bytes]:
     environment = clean_environment() | ({} if server is None else {"STRAIGHTPCF_URL": server.url})
     loaded = MODEL if {"denoise", "watch"} & {*arguments} and "--url" not in arguments else SDK
-    return run_warm("straightpcf.clients.cli", *arguments, environment=environment, stdin=stdin, loaded=loaded)
+    return run_warm(
+        "straightpcf.clients.cli", *arguments, environment=environment, stdin=stdin, stdout=stdout, stderr=stderr,
+        loaded=loaded,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -71,7 +80,7 @@ def test_a_job_that_fails_gives_wait_the_exit_code_of_its_error(server: RunningS
 
 
 def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, tmp_path: Path) -> None:
-    np.save(tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    np.save(tmp_path / "large.npy", noisy(sphere(LARGE), 0.01))
     for arguments, code, text in (
         (("status", "no-such-job"), 3, "not_found"),
         (("status", ""), 3, "not_found"),  # an unset $ID
@@ -85,7 +94,7 @@ def test_what_goes_wrong_between_is_one_line_and_a_code(server: RunningServer, t
         done = cli(server, *arguments)
         assert (done.returncode, done.stderr.count(b"\n")) == (code, 1), done.stderr
         assert text in done.stderr.decode()
-    id = cli(server, "submit", tmp_path / "large.npy").stdout.decode().strip()
+    id = cli(server, "submit", tmp_path / "large.npy", "--iterations", 10).stdout.decode().strip()
     assert cli(server, "wait", id, "--timeout", 0.2).returncode == 5
     assert cli(server, "cancel", id).stdout.decode() == f"{id} canceled\n"
     assert cli(server, "wait", id).returncode == 130
@@ -125,11 +134,9 @@ def test_a_full_stdout_is_named_and_ends_what_it_cannot_tell_of(server: RunningS
     assert cli(server, "wait", kept).returncode == 0
     before = len(cli(server, "jobs").stdout.splitlines())
     said = b"error [invalid_request]: [Errno 28] No space left on device: 'stdout'\n"
-    environment = clean_environment() | {"STRAIGHTPCF_URL": server.url}
     for arguments in (["submit", scan, scan, scan], ["result", kept, "-"], ["jobs"], ["status", kept, "--json"]):
         with Path("/dev/full").open("wb") as full:
-            command = [sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)]
-            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, check=False)
+            done = cli(server, *arguments, stdout=full.fileno())
         assert (done.returncode, done.stderr) == (3, said), arguments
     assert len(cli(server, "jobs").stdout.splitlines()) == before + 1  # of three that were to be submitted
 
@@ -137,11 +144,13 @@ def test_a_full_stdout_is_named_and_ends_what_it_cannot_tell_of(server: RunningS
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
 def test_what_stderr_does_not_take_changes_no_exit_code(scan: Path) -> None:
     done = ("denoise", scan, scan.with_name("out.npy"), "--iterations", 1, "--device", "cpu")
-    for arguments, code in ((done, 0), (("info", "missing.npy"), 3), (("frobnicate",), 2)):
-        command = shlex.join([sys.executable, "-m", "straightpcf.clients.cli", *map(str, arguments)])
-        for line in (f"{command} 2>/dev/full", f"exec 3> >(exec <&-); sleep 0.2; {command} 2>&3"):  # a reader that ends
-            ended = subprocess.run(["bash", "-c", line], env=clean_environment(), timeout=60, check=False)
-            assert ended.returncode == code, line
+    reader, unread = os.pipe()
+    os.close(reader)  # one that has ended
+    with Path("/dev/full").open("wb") as full, os.fdopen(unread, "wb") as pipe:
+        for arguments, code in ((done, 0), (("info", "missing.npy"), 3), (("frobnicate",), 2)):
+            for stderr in (full, pipe):
+                ended = cli(None, *arguments, stderr=stderr.fileno())
+                assert ended.returncode == code, (arguments, stderr)
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
@@ -251,9 +260,10 @@ def test_submit_takes_text_from_stdin_with_its_name(server: RunningServer) -> No
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_denoise_that_is_ended_takes_its_job_along(server: RunningServer, tmp_path: Path, number: int) -> None:
-    np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    np.save(large := tmp_path / "large.npy", noisy(sphere(LARGE), 0.01))
     command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]
-    process = subprocess.Popen([*command, "--url", server.url], env=clean_environment(), stderr=subprocess.DEVNULL)
+    command += ["--iterations", "10", "--url", server.url]
+    process = subprocess.Popen(command, env=clean_environment(), stderr=subprocess.DEVNULL)
     wait_for(lambda: b"processing" in cli(server, "jobs").stdout)
     process.send_signal(number)
     assert process.wait(timeout=20) == 130
@@ -263,9 +273,9 @@ def test_denoise_that_is_ended_takes_its_job_along(server: RunningServer, tmp_pa
 
 @pytest.mark.parametrize("pause", [0.0, 0.02, 0.2])
 def test_a_second_ctrl_c_is_as_quiet_as_the_first(tmp_path: Path, pause: float) -> None:
-    np.save(large := tmp_path / "large.npy", noisy(sphere(60_000), 0.01))
+    np.save(large := tmp_path / "large.npy", noisy(sphere(LARGE), 0.01))
     command = [sys.executable, "-m", "straightpcf.clients.cli", "denoise", str(large), str(tmp_path / "clean.npy")]
-    command += ["--device", "cpu", "--threads", "1"]
+    command += ["--device", "cpu", "--threads", "1", "--iterations", "10"]
     with subprocess.Popen(command, env=clean_environment(), stderr=subprocess.PIPE) as process:
         try:
             wait_for(lambda: list(tmp_path.glob(".clean.*.part.npy")), seconds=60)

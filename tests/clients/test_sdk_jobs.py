@@ -48,7 +48,7 @@ from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
 
 SMALL = noisy(torus(400), 0.01)
-LARGE = noisy(sphere(60_000), 0.01)  # takes the worker many seconds
+LARGE = noisy(sphere(12_000), 0.01)  # ten passes take the worker many seconds
 
 
 @pytest.fixture(params=["http", "grpc"])
@@ -132,7 +132,7 @@ def test_progress_is_told_with_and_without_a_limit(client: Client) -> None:
 
 
 def test_a_wait_that_is_too_short_ends_and_a_denoise_takes_its_job_along(client: Client) -> None:
-    job = client.jobs.create(LARGE, iterations=1)
+    job = client.jobs.create(LARGE, iterations=10)
     with pytest.raises(JobNotFinished):
         job.wait(timeout=0.2)
     with pytest.raises(JobNotFinished):
@@ -144,7 +144,7 @@ def test_a_wait_that_is_too_short_ends_and_a_denoise_takes_its_job_along(client:
         list(job.patches())
     job.delete()
     with pytest.raises(JobNotFinished):
-        client.denoise(LARGE, iterations=1, timeout=0.3)
+        client.denoise(LARGE, iterations=10, timeout=0.3)
     assert not list(client.jobs.list(states=["queued", "starting", "processing"]))
 
 
@@ -156,7 +156,7 @@ def test_a_short_timeout_is_no_limit_to_a_job_that_waits_its_turn(url: str, monk
             return (await client.denoise(SMALL, iterations=1)).points
 
     with Client(url) as patient, Client(url, timeout=0.5) as hasty, ThreadPoolExecutor() as pool:
-        first = patient.jobs.create(LARGE, iterations=3)
+        first = patient.jobs.create(LARGE, iterations=10)
         threading.Timer(3.5, first.cancel).start()
         others = [
             pool.submit(lambda: hasty.denoise(SMALL, iterations=1).points),
@@ -176,7 +176,7 @@ def test_events_and_patches_of_a_job_that_waits_long_are_waited_for(url: str, mo
             return sum([len(frame.indices) async for frame in (await client.jobs.get(id)).patches()])
 
     with Client(url) as patient, Client(url, timeout=0.3, max_retries=1) as hasty:
-        first = patient.jobs.create(LARGE, iterations=3)
+        first = patient.jobs.create(LARGE, iterations=10)
         job = hasty.jobs.create(SMALL, iterations=1)
         with ThreadPoolExecutor() as pool:
             also = pool.submit(asyncio.run, there(job.id))
@@ -244,7 +244,7 @@ def test_the_async_client_does_the_same_and_a_cancelled_coroutine_ends_its_job(u
             assert [found.id async for found in client.jobs.list()].index(job.id) == 0
             await job.delete()
             told: list[float] = []
-            task = asyncio.create_task(client.denoise(LARGE, iterations=1, on_progress=told.append))
+            task = asyncio.create_task(client.denoise(LARGE, iterations=10, on_progress=told.append))
             while not told:
                 await asyncio.sleep(0.05)
             task.cancel()
