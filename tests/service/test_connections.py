@@ -143,7 +143,7 @@ def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> 
     async def scenario() -> None:
         backend = willing()
         backend.finish.clear()
-        async with serving(tmp_path, backend, upload_idle_seconds=0.3) as (_, host, port):
+        async with serving(tmp_path, backend, upload_idle_seconds=0.3, shutdown_seconds=0.1) as (_, host, port):
             reader, writer = await asyncio.open_connection(host, port)
             made = b"PUT /jobs/a?filename=a.xyz HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(CLOUD)
             asked = b"GET /jobs/a?wait=1 HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
@@ -163,7 +163,7 @@ def test_an_answer_has_the_date_at_which_it_begins_and_not_that_of_its_request(t
     async def scenario() -> None:
         backend = willing()
         backend.finish.clear()
-        async with serving(tmp_path, backend) as (_, host, port):
+        async with serving(tmp_path, backend, shutdown_seconds=0.1) as (_, host, port):
             reader, writer = await asyncio.open_connection(host, port)
             writer.write(POST.replace(b"\r\n", b"\r\nPrefer: wait=3\r\n", 1))
             head = await reader.readuntil(b"\r\n\r\n")

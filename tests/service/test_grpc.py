@@ -320,7 +320,7 @@ def test_the_committed_stubs_are_what_the_schema_gives(tmp_path: Path) -> None:
 
 def test_a_call_that_never_says_its_config_is_told_before_the_server_ends(tmp_path: Path) -> None:
     with (
-        run_server(tmp_path, "--grpc-port", "0", environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "4"}) as server,
+        run_server(tmp_path, "--grpc-port", "0", environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "2"}) as server,
         grpc.insecure_channel(server.grpc_url.removeprefix("grpc://")) as channel,
     ):
         over = threading.Event()

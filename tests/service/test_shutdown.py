@@ -49,7 +49,7 @@ def test_a_signal_to_the_whole_group_lets_the_running_request_finish_too(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     # As systemd, `timeout` and a terminal that is closed do: the worker is in the server's group.
-    np.save(cloud := tmp_path / "cloud.npy", noisy(torus(3000), 0.01))
+    np.save(cloud := tmp_path / "cloud.npy", noisy(torus(1500), 0.01))
     with run_server(tmp_path, within=("setsid",)) as server:
         server.wait_until_ready()
         command = ["curl", "-s", "--data-binary", f"@{cloud}", f"{server.url}/denoise?iterations=2"]
@@ -57,7 +57,7 @@ def test_a_signal_to_the_whole_group_lets_the_running_request_finish_too(
         wait_for(lambda: list(server.data_dir.glob("jobs/*/patches-1")))
         os.killpg(server.process.pid, number)
         body, _ = request.communicate(timeout=60)
-        assert np.load(io.BytesIO(body)).shape == (3000, 3)
+        assert np.load(io.BytesIO(body)).shape == (1500, 3)
         assert server.process.wait(timeout=20) == 0
         assert "starts again" not in server.log.read_text()
 
@@ -65,7 +65,7 @@ def test_a_signal_to_the_whole_group_lets_the_running_request_finish_too(
 def test_who_waits_in_vain_is_told_so_before_a_server_ends(tmp_path: Path) -> None:
     np.save(long := tmp_path / "long.npy", noisy(torus(60_000), 0.01))
     np.save(short := tmp_path / "short.npy", noisy(torus(400), 0.01))
-    with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "3"}) as server:
+    with run_server(tmp_path, environment={"STRAIGHTPCF_SHUTDOWN_SECONDS": "2"}) as server:
         server.wait_until_ready()
         subprocess.run(["curl", "-s", "-T", long, f"{server.url}/jobs/long?iterations=9"], check=True)
         asked = ("denoise?iterations=1", "jobs/long?wait=60", "jobs/long/events", "jobs/long/stream")
