@@ -344,7 +344,7 @@ def test_sigterm_lets_a_call_finish(tmp_path: Path) -> None:
         grpc.insecure_channel(server.grpc_url.removeprefix("grpc://")) as channel,
     ):
         server.wait_until_ready()
-        answers = DenoiseServiceStub(channel).Denoise(denoise_parts(npy(noisy(torus(3000), 0.01)), return_file=True))
+        answers = DenoiseServiceStub(channel).Denoise(denoise_parts(npy(noisy(torus(1500), 0.01)), return_file=True))
         assert next(answers).WhichOneof("part") == "accepted"
         server.process.send_signal(signal.SIGTERM)
         assert list(answers)[-1].summary.state == pb.JOB_STATE_SUCCEEDED
