@@ -40,8 +40,10 @@ from straightpcf.service.jobs.record import (
 from straightpcf.service.jobs.rows import event_of, record_of
 from straightpcf.service.jobs.turns import BY_STATE, count_turn, next_row, positions
 
-__all__ = ["MAX_SERVER_DEATHS", "JobStore"]
+__all__ = ["BATCH", "MAX_SERVER_DEATHS", "SHRINK_PAGES", "JobStore"]
 
+# What is done to all that is over at once: everything else waits for a transaction, also at other servers.
+BATCH, SHRINK_PAGES = 200, 250
 MAX_SERVER_DEATHS = 6  # more than the runner's MAX_DEATHS of workers, for servers die of much else
 _ACTIVE: tuple[JobState, ...] = ("queued", "starting", "processing")
 _WORKING: tuple[JobState, ...] = ("starting", "processing")
@@ -274,28 +276,38 @@ class JobStore:
                 self._requeued(row["id"], "nobody works on it any more; the job starts again", expires_in)
         return [row["id"] for row in rows]
 
-    def over(self) -> list[str]:
-        """Name the folders of what is over its time, and not marked so; writes nothing."""
-        query = f"SELECT folder FROM jobs WHERE state IN {_ENDED} AND expires_at < ?"
-        return [row["folder"] for row in self._db.execute(query, (time.time(),))]
+    def over(self, behind: int = 0) -> list[str]:
+        """Name folders of what is over its time, and not marked so: BATCH behind the first ones; writes nothing."""
+        query = f"SELECT folder FROM jobs WHERE state IN {_ENDED} AND expires_at < ? LIMIT {BATCH} OFFSET ?"
+        return [row["folder"] for row in self._db.execute(query, (time.time(), behind))]
 
-    def expire(self, *, rows_after: float) -> list[str]:
-        """Mark what is over its time, forget what has been so for rows_after seconds; return folders to remove.
+    def expire(self) -> list[str]:
+        """Mark BATCH jobs that are over their time, or those that there are; return the folders to remove.
 
-        What a job showed on its way goes with its files: previews are a hundred times its row. The room is given back.
+        What a job showed on its way goes with its files: previews are a hundred times its row.
         """
         with self._transaction():
-            now = time.time()
-            query = (
-                f"UPDATE jobs SET state = 'expired' WHERE state IN {_ENDED} AND expires_at < ? RETURNING seq, folder"
-            )
-            expired = self._db.execute(query, (now,)).fetchall()
+            over = f"SELECT seq FROM jobs WHERE state IN {_ENDED} AND expires_at < ? LIMIT {BATCH}"
+            query = f"UPDATE jobs SET state = 'expired' WHERE seq IN ({over}) RETURNING seq, folder"
+            expired = self._db.execute(query, (time.time(),)).fetchall()
             query = f"DELETE FROM events WHERE job = ? AND kind IN {_PASSING}"
             self._db.executemany(query, [(row["seq"],) for row in expired])
-            self._db.execute("DELETE FROM jobs WHERE state = 'expired' AND expires_at < ?", (now - rows_after,))
-        with suppress(sqlite3.OperationalError):  # a full disk, or others are at it: the next time will do
-            self._db.executescript("PRAGMA incremental_vacuum")  # `execute` takes one step, which frees one page
         return [row["folder"] for row in expired]
+
+    def forget(self, *, rows_after: float) -> int:
+        """Remove BATCH rows that have been over their time for rows_after seconds; return how many there were."""
+        with self._transaction():
+            old = f"SELECT seq FROM jobs WHERE state = 'expired' AND expires_at < ? LIMIT {BATCH}"
+            return self._db.execute(f"DELETE FROM jobs WHERE seq IN ({old})", (time.time() - rows_after,)).rowcount
+
+    def shrink(self) -> bool:
+        """Give room back that the database does not need, SHRINK_PAGES at a time; tell whether there may be more."""
+        with suppress(sqlite3.OperationalError):  # a full disk, or others are at it: the next time will do
+            before = self._free_pages()
+            # `execute` takes one step, which frees one page.
+            self._db.executescript(f"PRAGMA incremental_vacuum({SHRINK_PAGES})")
+            return 0 < self._free_pages() < before  # of a file of before room was given back none is
+        return False
 
     def servers(self) -> set[str]:
         """Name the servers that hold jobs."""
@@ -314,6 +326,9 @@ class JobStore:
 
     def _transaction(self) -> AbstractContextManager[None]:
         return transaction(self._db)
+
+    def _free_pages(self) -> int:
+        return int(self._db.execute("PRAGMA freelist_count").fetchone()[0])
 
     def _known(self, job: NewJob) -> sqlite3.Row | None:
         if job.idempotency_key is not None:

@@ -331,10 +331,10 @@ def test_what_is_over_its_time_makes_the_room_that_marking_it_takes(
 ) -> None:
     expire = JobStore.expire
 
-    def expire_if_there_is_room(store: JobStore, *, rows_after: float) -> list[str]:
+    def expire_if_there_is_room(store: JobStore) -> list[str]:
         if list((tmp_path / "jobs").iterdir()):
             raise SpoolFull("the server's disk is full")
-        return expire(store, rows_after=rows_after)
+        return expire(store)
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
         backend.go.set()

@@ -53,7 +53,7 @@ def test_a_result_that_is_taken_away_before_it_is_opened_is_a_problem(
                     await engine.delete(id, owner=owner)
                 elif path.exists():
                     await asyncio.sleep(ttl)
-                    await engine._call(JobStore.expire, rows_after=3600)
+                    await engine._call(JobStore.expire)
                     path.unlink()
                 return path, record
 

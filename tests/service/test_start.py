@@ -70,7 +70,7 @@ def test_limits_under_which_no_job_can_be_done_are_said_at_the_start(
 
 
 def test_a_first_sweep_that_fails_is_made_up_for_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(store: JobStore, *, rows_after: float) -> list[str]:
+    def full(store: JobStore) -> list[str]:
         raise SpoolFull("the server's disk is full")
 
     async def scenario(engine: Engine, backend: ObedientBackend) -> None:
