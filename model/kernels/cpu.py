@@ -83,7 +83,7 @@ def load() -> ctypes.CDLL | None:
     failed: Exception | None = None
     for name in instruction_sets():  # a compiler may be older than the processor
         try:
-            library = _found(name) or _open(build(_cache(), name))
+            library = _found(name) or _open_whole(build(_cache(), name))
         except (OSError, subprocess.SubprocessError) as exc:
             failed = failed or exc
             continue
@@ -96,18 +96,17 @@ def load() -> ctypes.CDLL | None:
 
 def _found(target_set: str) -> ctypes.CDLL | None:
     """Open what was shipped or built before; None where there is none, or it is cut short or made for another libc."""
-    name = _file_name(target_set)
+    folders = [_SHIPPED]
     with suppress(OSError):
-        if (shipped := _SHIPPED / name).is_file():
-            return _open(shipped)
-    with suppress(OSError):
-        if (built := _cache() / name).is_file():
-            return _open(built)
+        folders.append(_cache())
+    for path in [path for folder in folders for path in sorted(folder.glob(_file_name(target_set, "*")))]:
+        with suppress(OSError):
+            return _open_whole(path)
     return None
 
 
 def build(folder: Path, target_set: str) -> Path:
-    """Compile for an instruction set into `folder`.
+    """Compile for an instruction set into `folder`; the file's name says what is in it, for `_open_whole`.
 
     Raises OSError or SubprocessError where that fails.
     """
@@ -115,7 +114,6 @@ def build(folder: Path, target_set: str) -> Path:
     if compiler is None:
         raise OSError("no C++ compiler: install g++")
     folder.mkdir(parents=True, exist_ok=True)
-    target = folder / _file_name(target_set)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         built = Path(scratch) / "kernel.so"
         flags = [*_FLAGS.split(), *_compiled_sets()[target_set].split()]
@@ -123,8 +121,10 @@ def build(folder: Path, target_set: str) -> Path:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_SECONDS, check=False)
         if done.returncode != 0:
             raise OSError(f"{compiler} failed: {done.stderr.strip()[:500]}")
-        built.replace(target)  # atomic: two processes may build at once
-    return target
+        with built.open("rb") as file:
+            os.fsync(file.fileno())  # raises where a full disk has no room for what it seemed to take
+            target = folder / _file_name(target_set, _digest(file.read()))
+        return built.replace(target)  # atomic: two processes may build at once
 
 
 def _cache() -> Path:
@@ -141,11 +141,25 @@ def build_all(folder: Path) -> list[Path]:
     return [build(folder, name) for name in _compiled_sets()]
 
 
-def _file_name(target_set: str) -> str:
+def _file_name(target_set: str, content: str) -> str:
+    """Return what a library is called, by what it is made of and by the digest of its content."""
     read = b"".join(path.read_bytes() for path in _SOURCES + _HEADERS)
     flags = f"{_FLAGS} {_compiled_sets()[target_set]}"
-    digest = hashlib.sha256(read + flags.encode()).hexdigest()[:12]
-    return f"kernels-{platform.machine()}-{target_set}-{digest}.so"
+    return f"kernels-{platform.machine()}-{target_set}-{_digest(read + flags.encode())}-{content}.so"
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:12]
+
+
+def _open_whole(path: Path) -> ctypes.CDLL:
+    """Open a library that `build` made; raises OSError where it is cut short or overwritten.
+
+    It is mapped, not read: one that is opened all the same ends the process, then or when it is first called.
+    """
+    if not path.stem.endswith(f"-{_digest(path.read_bytes())}"):
+        raise OSError(f"{path} is damaged")
+    return _open(path)
 
 
 def _open(path: Path) -> ctypes.CDLL:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import platform
 import shutil
 import subprocess
@@ -98,7 +100,7 @@ def test_a_compiler_older_than_the_processor_compiles_for_an_older_one(
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(cpu, "instruction_sets", lambda: ("amx_bf16", "avx512_bf16", "avx2", "generic"))
     monkeypatch.setattr(cpu, "build", build)
-    monkeypatch.setattr(cpu, "_open", lambda path: path.name)
+    monkeypatch.setattr(cpu, "_open_whole", lambda path: path.name)
     with pytest.warns(UserWarning, match=r"for avx2 only, which is slower here \(c\+\+: error: .* for amx_bf16\)"):
         assert cpu.load.__wrapped__() == "compiled.so"
     assert tried == ["amx_bf16", "avx512_bf16", "avx2"]
@@ -114,29 +116,82 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "straightpcf"
 
 
-@pytest.mark.skipif(cpu.load() is None, reason="no C++ compiler and no shipped kernels")
+def kept_as(folder: Path, content: bytes, *, named: bytes | None = None) -> Path:
+    """Leave a library, by its own name or by that of another content."""
+    folder.mkdir(exist_ok=True)
+    path = folder / cpu._file_name("generic", cpu._digest(content if named is None else named))
+    path.write_bytes(content)
+    return path
+
+
+@pytest.fixture
+def good(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    """What compiling gives, in less time."""
+    library = cpu.load()
+    if library is None:
+        pytest.skip("no C++ compiler and no shipped kernels")
+    content = Path(library._name).read_bytes()
+    monkeypatch.setattr(cpu, "build", lambda folder, name: kept_as(folder, content))
+    return content
+
+
 @pytest.mark.parametrize("kept", [b"", b"\x7fELF of another machine", b"#!/bin/sh\n"])
-def test_a_library_that_does_not_open_is_compiled_again(
-    kept: bytes, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_library_that_does_not_open_is_compiled_again(kept: bytes, own_cache: Path, good: bytes) -> None:
+    kept_as(own_cache, kept)
+    assert cpu.load.__wrapped__()._name == str(own_cache / cpu._file_name("generic", cpu._digest(good)))
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
+def test_a_library_that_is_cut_short_is_compiled_again(part: float, own_cache: Path, good: bytes) -> None:
+    """It was opened, and the process ended: by SIGBUS, then or at the first call of what was not there."""
+    path = kept_as(own_cache, good[: int(part * len(good))], named=good)
+    library = cpu.load.__wrapped__()
+    assert path.read_bytes() == good
+    assert cpu.knn(library, torch.rand(1, 50, 3), 4, 50).shape == (1, 50, 4)
+
+
+def test_a_library_that_was_overwritten_is_none_of_ours(own_cache: Path, good: bytes) -> None:
+    path = kept_as(own_cache, good[:-1] + b"x", named=good)
+    with pytest.raises(OSError, match="is damaged"):
+        cpu._open_whole(path)
+    assert cpu._found("generic") is None
+
+
+def test_of_two_libraries_the_one_that_opens_is_taken(own_cache: Path, good: bytes) -> None:
+    """As where machines of two libcs have one home: neither compiles over the other's."""
+    for salt in range(20):
+        kept_as(own_cache, b"of another libc: %d" % salt)
+    path = kept_as(own_cache, good)
+    assert cpu._found("generic")._name == str(path)
+
+
+def test_a_disk_that_is_full_behind_the_compiler_leaves_no_library(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    good = cpu.load()
-    path = own_cache / cpu._file_name("generic")
-    path.parent.mkdir()
-    path.write_bytes(kept)
+    """Some tell at fsync alone."""
 
-    def build(folder: Path, name: str) -> Path:
-        shutil.copy(good._name, folder / "built.so")  # what compiling gives, in less time
-        return (folder / "built.so").replace(folder / cpu._file_name(name))
+    def compiled(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        Path(command[-1]).write_bytes(b"to be written")
+        return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(cpu, "build", build)
-    assert cpu.load.__wrapped__()._name == str(path)
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "which", str)
+    monkeypatch.setattr(subprocess, "run", compiled)
+    whole = cpu.build(own_cache, "generic")
+    assert whole.name == cpu._file_name("generic", cpu._digest(b"to be written"))
+    whole.unlink()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        cpu.build(own_cache, "generic")
+    assert not list(own_cache.iterdir())
 
 
 def test_where_a_library_neither_opens_nor_compiles_torch_does_the_work(
     own_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own_cache.mkdir()
-    (own_cache / cpu._file_name("generic")).write_bytes(b"no library")
+    kept_as(own_cache, b"no library")
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.warns(UserWarning, match=r"not compiled \(no C\+\+ compiler: install g\+\+\); plain torch is used"):
         assert cpu.load.__wrapped__() is None
@@ -160,17 +215,16 @@ def test_a_user_without_a_home_gets_what_is_shipped_or_torch(own_cache: Path, mo
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.warns(UserWarning, match=r"determine home directory\. Set HOME .*; plain torch is used"):
         assert cpu.load.__wrapped__() is None
-    cpu._SHIPPED.mkdir()
-    (cpu._SHIPPED / cpu._file_name("generic")).touch()
+    kept_as(cpu._SHIPPED, b"shipped")
     monkeypatch.setattr(cpu, "_open", lambda path: path)
     assert cpu.load.__wrapped__().parent == cpu._SHIPPED
 
 
 def test_other_flags_of_a_set_are_another_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
-    names = {cpu._file_name(name) for name in cpu._X86}
+    names = {cpu._file_name(name, "") for name in cpu._X86}
     monkeypatch.setattr(cpu, "_X86", {name: f"{flags} -mtune=native" for name, flags in cpu._X86.items()})
-    assert names.isdisjoint(cpu._file_name(name) for name in cpu._X86)
+    assert names.isdisjoint(cpu._file_name(name, "") for name in cpu._X86)
 
 
 @pytest.mark.slow
