@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -19,7 +20,14 @@ from straightpcf.clients.sdk.receive import Receiver
 from straightpcf.clients.sdk.request import Call
 from straightpcf.clients.sdk.retry import Failure
 from straightpcf.clients.sdk.silence import Silence
-from straightpcf.points.errors import ERRORS_BY_CODE, ConnectionFailed, InternalError, StraightPCFError, TooManyBytes
+from straightpcf.points.errors import (
+    ERRORS_BY_CODE,
+    ConnectionFailed,
+    InternalError,
+    ServerBusy,
+    StraightPCFError,
+    TooManyBytes,
+)
 from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire.messages import event_of, frame_of, message_of, plain_of
 from straightpcf.points.wire.patches import encode_end, encode_frame, encode_header
@@ -28,6 +36,8 @@ __all__ = ["UPLOAD", "Answer", "Upload", "failed_rpc", "metadata_of", "request_o
 
 UPLOAD = "CreateJob"
 _PART_BYTES = 2**16  # of a file in one message: it is taken whole or not at all, and a line may be slow
+# What gRPC says of a message that is larger than one side takes, or of metadata that are.
+_TOO_LARGE = re.compile(r"(?:larger than max|exceeds hard limit) \(\D*(\d+) vs\. (\d+)\)")
 
 _REQUESTS: Mapping[str, type[Message]] = {
     "GetJob": pb.GetJobRequest,
@@ -167,7 +177,10 @@ def failed_rpc(error: grpc.RpcError, url: str) -> Failure:
     if reason is not None:
         ours = ERRORS_BY_CODE.get(reason, InternalError)(text, request_id=request_id)
         return Failure(error=ours, retryable=ours.retryable, retry_after=retry_after, cause=error)
-    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return Failure(error=TooManyBytes(text), retryable=False, cause=error)
+    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:  # of gRPC itself, on either side, or of a proxy
+        if (sizes := _TOO_LARGE.search(text)) is None:
+            return Failure(error=ServerBusy(f"{url}: {text}"), retryable=True, cause=error)
+        said = f"{url}: {sizes[1]} bytes at once; the limit is {sizes[2]} ({text})"
+        return Failure(error=TooManyBytes(said), retryable=False, cause=error)
     again = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
     return Failure(error=ConnectionFailed(f"{url}: {code.name}: {text}"), retryable=code in again, cause=error)

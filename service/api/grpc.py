@@ -22,7 +22,6 @@ from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire import straightpcf_pb2_grpc as stubs
 from straightpcf.points.wire.jobs import MAX_EVENT_ID, MAX_PAGE_SIZE
 from straightpcf.points.wire.messages import (
-    MAX_MESSAGE_BYTES,
     event_message,
     message_of,
     name_of,
@@ -48,7 +47,9 @@ WRITE_BYTES = 2**20
 HEALTH_SECONDS = 0.25
 FORGETTING_SECONDS = 1.0
 _OPTIONS = (
-    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES + 4096),  # a chunk of 1 MiB, and what is around it
+    # Above LARGEST_MESSAGE, so that this service says itself what is too large: gRPC says it without ErrorInfo. 4 MiB,
+    # and what is around them, is what its servers take otherwise.
+    ("grpc.max_receive_message_length", 2**22 + 4096),
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
     # gRPC cancels a call that a busy event loop has not taken after 30 s; how long it waits is its caller's to say.
     ("grpc.server_max_unrequested_time_in_server", 3600),

@@ -17,15 +17,17 @@ from google.protobuf.message import DecodeError
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError
+from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError, TooManyBytes
+from straightpcf.points.wire.messages import MAX_MESSAGE_BYTES
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS, busy
 from straightpcf.service.api.intake import checked_key
 from straightpcf.service.api.request_id import usable_id
 from straightpcf.service.telemetry import Telemetry
 
-__all__ = ["Caller", "Context", "LateParsing", "answering"]
+__all__ = ["LARGEST_MESSAGE", "Caller", "Context", "LateParsing", "answering"]
 
+LARGEST_MESSAGE = MAX_MESSAGE_BYTES + 4096  # a chunk of 1 MiB, and what is around it
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
 _CANCELLED_WITHIN_SECONDS = 1.0
@@ -47,7 +49,7 @@ class Caller:
 
 
 class LateParsing(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc.aio is untyped
-    """Let a request that is none of the schema's reach its method: grpc itself would answer UNKNOWN, and no more."""
+    """Let a request that is too large or none of the schema's reach its method: grpc's own answer has no ErrorInfo."""
 
     async def intercept_service(
         self,
@@ -56,14 +58,16 @@ class LateParsing(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc.aio
     ) -> grpc.RpcMethodHandler:
         """Return the handler of a call; what its single request is, is told where that is first looked at."""
         handler: Any = await continuation(handler_call_details)
-        if handler is None or handler.request_streaming:  # the messages of a stream are parsed inside of the method
+        if handler is None:
             return handler
         parse = handler.request_deserializer
-        return handler._replace(request_deserializer=lambda data: _parsed(parse, data))
+        if handler.request_streaming:  # the messages of a stream are parsed inside of the method
+            return handler._replace(request_deserializer=lambda data: _parsed(parse, data))
+        return handler._replace(request_deserializer=lambda data: _parsed_late(parse, data))
 
 
 class _Unparsable:
-    def __init__(self, fault: DecodeError) -> None:
+    def __init__(self, fault: DecodeError | TooManyBytes) -> None:
         self._fault = fault
 
     def __getattr__(self, name: str) -> Never:
@@ -71,9 +75,16 @@ class _Unparsable:
 
 
 def _parsed(parse: Callable[[bytes], Any], data: bytes) -> Any:
+    if len(data) > LARGEST_MESSAGE:
+        said = f"a message of the call has {len(data)} bytes; the limit is {LARGEST_MESSAGE}: send a file in more"
+        raise TooManyBytes(said)
+    return parse(data)
+
+
+def _parsed_late(parse: Callable[[bytes], Any], data: bytes) -> Any:
     try:
-        return parse(data)
-    except DecodeError as fault:
+        return _parsed(parse, data)
+    except (DecodeError, TooManyBytes) as fault:
         return _Unparsable(fault)
 
 

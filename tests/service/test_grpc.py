@@ -194,6 +194,24 @@ def test_a_file_that_is_said_to_be_too_large_is_refused_before_it_comes(stub: An
     assert (status, info.reason) == ("INVALID_ARGUMENT", "TOO_MANY_BYTES")
 
 
+@pytest.mark.parametrize("size", [2**20 + 5000, 2**22])
+def test_a_message_that_is_too_large_is_refused_with_its_code(channel: Any, stub: Any, size: int) -> None:
+    """As of a client that sends its file in one: gRPC's own answer has no code, and is for what is larger still."""
+    config = pb.JobConfig(filename="cloud.xyz")
+    status, info = error_of(lambda: stub.CreateJob(parts(pb.CreateJobRequest, config, bytes(size), size)))
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "TOO_MANY_BYTES")
+    assert info.metadata["request_id"]
+    with pytest.raises(grpc.RpcError, match=rf"has \d+ bytes; the limit is {2**20 + 4096}: send a file"):
+        stub.GetJob(pb.GetJobRequest(id="x" * size))
+
+
+def test_a_message_of_a_mebibyte_is_taken(stub: Any) -> None:
+    body = b"0 0 0\n" * (2**20 // 6)
+    config = pb.JobConfig(filename="cloud.xyz", options=pb.DenoiseOptions(iterations=1), bytes=len(body))
+    job = stub.CreateJob(parts(pb.CreateJobRequest, config, body, len(body)))
+    stub.DeleteJob(pb.DeleteJobRequest(id=job.id))
+
+
 def test_a_stream_of_another_schema_is_the_callers_fault(server: RunningServer, channel: Any) -> None:
     call = channel.stream_unary("/straightpcf.v1.DenoiseService/CreateJob")
     status, info = error_of(lambda: call(iter([b"\xff\xff"])))
