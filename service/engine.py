@@ -9,8 +9,8 @@ import logging
 import time
 import uuid
 from collections.abc import AsyncGenerator, AsyncIterator, Collection, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -265,7 +265,7 @@ class Engine:
             await self._further(news, left)
 
     async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncGenerator[JobEvent, None]:
-        """Yield what happened behind event `after`, and then what happens, until `completed`.
+        """Yield what happened behind event `after`, and then what happens, until `completed`, which has the job.
 
         Raises ServerBusy where this server ends first, and NotFound where the job is deleted, also if its id is used
         again.
@@ -278,6 +278,8 @@ class Engine:
             events = await self._call(JobStore.events, folder, after)
             for event in events:
                 after = event.seq
+                if event.kind == "completed":
+                    event = replace(event, job=await self._same(id, owner, folder))
                 yield event
             if record.finished:
                 if not events:  # deleted between the two looks, it would seem to have told its end
@@ -294,7 +296,7 @@ class Engine:
             raise JobExpired(f"the result of job {id} has been removed")
         if record.state != "succeeded":
             raise JobNotFinished(f"job {id} is {record.state}, {100 * record.progress:.0f} % done")
-        return self._folders.path(record.folder) / await self._call(JobStore.result_file, id), record
+        return self._folders.path(record.folder) / await self._call(JobStore.result_file, id, record.folder), record
 
     async def patches(self, id: str, *, owner: str = "") -> AsyncIterator[bytes]:
         """Yield the patch stream (docs/api.md) as it grows; a second attempt goes on where the first one ended.
@@ -326,7 +328,7 @@ class Engine:
         await self._call(JobStore.request_cancel, id, record.folder, expires_in=self.limits.result_ttl_seconds)
         await self._runner.cancel(record.folder)
         self._notify(id)
-        return await self.get(id, owner=owner)
+        return await self._same(id, owner, record.folder)
 
     async def delete(self, id: str, *, owner: str = "") -> None:
         """Cancel a job if it is not finished, and remove its files and all that is known of it."""
@@ -384,11 +386,9 @@ def _check_id(id: str | None) -> None:
 
 
 async def _first(news: asyncio.Event, seconds: float) -> None:
-    try:
+    with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await news.wait()
-    except TimeoutError:
-        pass
 
 
 def _read_from(path: Path, offset: int) -> bytes:

@@ -42,9 +42,7 @@ def event_stream(
 async def _events(engine: Engine, id: str, owner: str, root: str, after: int) -> AsyncIterator[bytes]:
     try:
         async for event in engine.events(id, owner=owner, after=after):
-            data = event.data
-            if event.kind == "completed":
-                data = Job.of(await engine.get(id, owner=owner), root=root).plain()
+            data = event.data if event.job is None else Job.of(event.job, root=root).plain()
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n".encode()
     except (NotFound, ServerBusy):
         return  # deleted while we looked, or the server ends: without `completed`, so that a client comes again

@@ -207,10 +207,7 @@ class DenoiseService(stubs.DenoiseServiceServicer):
             if request.after > MAX_EVENT_ID:
                 raise InvalidRequest(f"after is {request.after}; it must be the id of an event")
             async for event in self._engine.events(request.id, owner=caller.owner, after=request.after):
-                record = None
-                if event.kind == "completed":
-                    record = await self._engine.get(request.id, owner=caller.owner)
-                await context.write(_event(event, record))
+                await context.write(_event(event))
 
     async def CancelJob(self, request: pb.CancelJobRequest, context: Context) -> pb.Job:  # noqa: N802
         """End a job."""
@@ -325,8 +322,8 @@ def _job(record: JobRecord) -> pb.Job:
     return message_of(pb.Job, Job.of(record).plain())
 
 
-def _event(event: JobEvent, record: JobRecord | None) -> pb.JobEvent:
-    data = event.data if record is None else Job.of(record).plain()
+def _event(event: JobEvent) -> pb.JobEvent:
+    data = event.data if event.job is None else Job.of(event.job).plain()
     return event_message(event.kind, event.seq, rfc3339(event.at), data)
 
 

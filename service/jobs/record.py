@@ -89,12 +89,13 @@ class JobRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class JobEvent:
-    """Hold one thing that happened; seq counts from 1 within the job."""
+    """Hold one thing that happened; seq counts from 1 within the job, which `completed` brings as it ended."""
 
     seq: int
     kind: EventKind
     data: dict[str, Any]
     at: datetime
+    job: JobRecord | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -148,8 +148,7 @@ class JobStore:
     def request_cancel(self, id: str, folder: str, *, expires_in: float) -> None:
         """Cancel a queued job at once; mark one that is worked on, for its server to see; NotFound if it is another."""
         with self._transaction():
-            if (row := self._row(id))["folder"] != folder:
-                raise NotFound(f"there is no job {id[:64]!r} any more; another has its id")
+            row = self._same_row(id, folder)
             if row["state"] == "queued":
                 self._end(id, "canceled", error=_canceled(id), expires_in=expires_in)
             elif row["state"] in _WORKING:
@@ -318,9 +317,9 @@ class JobStore:
         query = "SELECT 1 FROM jobs WHERE folder = ? AND state <> 'expired'"
         return [folder for folder in folders if self._db.execute(query, (folder,)).fetchone() is None]
 
-    def result_file(self, id: str) -> str:
-        """Name the result file inside the job's folder."""
-        return str(json.loads(self._row(id)["result"])["file"])
+    def result_file(self, id: str, folder: str) -> str:
+        """Name the result file inside the folder of a job that succeeded; NotFound if its id is another's by now."""
+        return str(json.loads(self._same_row(id, folder)["result"])["file"])
 
     # --- inside a transaction
 
@@ -350,6 +349,11 @@ class JobStore:
         if row is None or (owner is not None and row["owner"] != owner):
             raise NotFound(f"there is no job {id[:64]!r}")
         return row  # type: ignore[no-any-return]
+
+    def _same_row(self, id: str, folder: str) -> sqlite3.Row:
+        if (row := self._row(id))["folder"] != folder:
+            raise NotFound(f"there is no job {id[:64]!r} any more; another has its id")
+        return row
 
     def _update(self, id: str, fence: int, set_: str, *values: object) -> bool:
         query = f"UPDATE jobs SET {set_} WHERE id = ? AND fence = ? AND state IN {_WORKING}"

@@ -13,7 +13,7 @@ import pytest
 
 from straightpcf.service.engine import Engine
 from straightpcf.service.jobs.store import JobStore
-from tests.service.engines import until
+from tests.service.engines import submit, until
 from tests.service.fakes import CONTENT, ObedientBackend
 from tests.service.in_process import serving
 
@@ -120,6 +120,82 @@ def test_a_job_that_is_deleted_while_its_file_is_on_its_way_is_none(tmp_path: Pa
             writer.write(put)  # the next one is another
             assert b'"mine"' in await _answer(reader)
             writer.close()
+
+    play(scenario)
+
+
+def replacing(engine: Engine, backend: ObedientBackend, moment: Callable[..., Any], *, call: int = 1) -> list[str]:
+    """Give a finished job's id to another one around the call of a store's method; return the folders of both."""
+    through, folders, calls = engine._call, list[str](), 0
+
+    async def replace() -> None:
+        backend.finish.clear()
+        folders.append((await engine.get("mine")).folder)
+        await engine.delete("mine")
+        folders.append((await submit(engine, b"1 1 1\n", id="mine"))[0].folder)
+
+    async def with_another(function: Any, *args: Any, **kwargs: Any) -> Any:
+        nonlocal calls
+        calls += function is moment
+        if function is not moment or calls != call:
+            return await through(function, *args, **kwargs)
+        engine._call = through
+        if moment is JobStore.result_file:
+            await replace()
+            return await through(function, *args, **kwargs)
+        told = await through(function, *args, **kwargs)
+        await replace()
+        return told
+
+    engine._call = with_another  # type: ignore[assignment]
+    return folders
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "moment"),
+    [
+        ("GET", "/result", JobStore.result_file), ("GET", "/report", JobStore.result_file),
+        ("POST", "/cancel", JobStore.request_cancel), ("DELETE", "", JobStore.request_cancel),
+    ],
+)  # fmt: skip
+def test_what_is_asked_of_a_job_whose_id_is_anothers_by_then_is_not_found(
+    tmp_path: Path, method: str, path: str, moment: Callable[..., Any]
+) -> None:
+    """The other one was deleted in its place, shown for it, or a result it has not yet was a fault of the server."""
+
+    async def scenario() -> None:
+        backend = willing()
+        async with (
+            serving(tmp_path, backend) as (engine, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            await http.put("/jobs/mine?filename=a.xyz", content=CLOUD)
+            await engine.wait("mine")
+            folders = replacing(engine, backend, moment)
+            answer = await http.request(method, f"/jobs/mine{path}")
+            assert (answer.status_code, answer.json()["code"]) == (404, "not_found")
+            assert "another" in answer.json()["detail"]
+            other = await engine.get("mine")
+            assert (other.folder, other.finished) == (folders[1], False)
+            await engine.delete("mine")
+
+    play(scenario)
+
+
+def test_a_jobs_last_event_does_not_bring_another_job_that_has_its_id_by_then(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        backend = willing()
+        async with (
+            serving(tmp_path, backend) as (engine, host, port),
+            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+        ):
+            await http.put("/jobs/mine?filename=a.xyz", content=CLOUD)
+            await engine.wait("mine")
+            replacing(engine, backend, JobStore.events, call=2)
+            told = (await http.get("/jobs/mine/events")).text
+            assert "event: output" in told
+            assert "event: completed" not in told  # as of any job that is deleted
+            await engine.delete("mine")
 
     play(scenario)
 
