@@ -91,7 +91,8 @@ def _parsed_late(parse: Callable[[bytes], Any], data: bytes) -> Any:
 @asynccontextmanager
 async def answering(context: Context, method: str, *, gate: Gate, telemetry: Telemetry) -> AsyncIterator[Caller]:
     """Let a caller in, and end the call with a status that says what the block raised."""
-    said = {name: value for name, value in context.invocation_metadata() or () if isinstance(value, str)}
+    metadata = [pair for pair in context.invocation_metadata() or () if isinstance(pair[1], str)]
+    said = dict(metadata)
     id = usable_id(said.get("x-request-id"))
     status = "OK"
     try:
@@ -99,7 +100,7 @@ async def answering(context: Context, method: str, *, gate: Gate, telemetry: Tel
         yield Caller(
             owner=gate.admit(said.get("authorization"), gives_back=method in _GIVE_BACK),
             request_id=id,
-            idempotency_key=checked_key(said.get("idempotency-key")),
+            idempotency_key=checked_key([value for name, value in metadata if name == "idempotency-key"]),
             traceparent=said.get("traceparent"),
         )
     except StraightPCFError as error:

@@ -80,7 +80,7 @@ async def _take(
     request: Request, owner: str, endpoint: str, id: str | None, more_fields: frozenset[str]
 ) -> tuple[JobRecord, bool, Fields]:
     engine: Engine = request.app.state.engine
-    key = checked_key(request.headers.get("idempotency-key"))
+    key = checked_key(request.headers.getlist("idempotency-key"))
     await engine.check_room(size=declared_size(request), owner=owner, id=id, idempotency_key=key)
     query = request.query_params
     _check_once([name for name, _ in query.multi_items()])  # before the body, so that it need not be read
@@ -129,8 +129,11 @@ def _parse_fields(fields: Mapping[str, str], more: frozenset[str]) -> tuple[Deno
     return options, format or None
 
 
-def checked_key(key: str | None) -> str | None:
-    """Return an idempotency key; raises InvalidRequest where it is none."""
+def checked_key(keys: Sequence[str]) -> str | None:
+    """Return the idempotency key among all that a request says; raises InvalidRequest where it is none, or two are."""
+    if len(keys) > 1:
+        raise InvalidRequest(f"Idempotency-Key is said {len(keys)} times; which one is meant?")
+    key = keys[0] if keys else None
     if key is not None and (not 0 < len(key) <= MAX_KEY_LENGTH or not key.isprintable()):
         raise InvalidRequest(f"Idempotency-Key must be 1 to {MAX_KEY_LENGTH} printable characters, it has {len(key)}")
     return key

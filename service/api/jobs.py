@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import JSONResponse, Response
 
-from straightpcf.points.errors import InvalidRequest
+from straightpcf.points.errors import InvalidRequest, PreconditionFailed
 from straightpcf.points.wire.jobs import MAX_PAGE_SIZE
 from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE
 from straightpcf.service.api.auth import owner_of, owner_who_gives_back
@@ -137,9 +137,12 @@ async def cancel_job(id: str, request: Request, owner: OwnerWhoGivesBack) -> Res
     return job_response(request, after, 200 if before.finished else 202)
 
 
-@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 507), summary="Delete a job")
+@router.delete("/jobs/{id}", status_code=204, responses=problems(401, 403, 404, 412, 507), summary="Delete a job")
 async def delete_job(id: str, request: Request, owner: OwnerWhoGivesBack) -> None:
     """Remove a job, its files and its events, whatever its state; also one whose file is still on its way."""
+    wanted = ",".join(request.headers.getlist("if-match") or ["*"])
+    if "*" not in [tag.strip() for tag in wanted.split(",")]:  # RFC 9110, 13.1.1: then it must not be done
+        raise PreconditionFailed(f"a job has no ETag, so that If-Match cannot name it by {wanted[:80]!r}; it is kept")
     coming: Coming = request.app.state.coming
     await coming.delete(owner, id)
 

@@ -220,7 +220,7 @@ _PROBLEMS = {
     408: "The body stopped coming (`request_timeout`).",
     409: "It is not finished, was canceled, or its id is taken (`job_not_finished`, `job_canceled`, `id_conflict`).",
     410: "Its files have been removed (`job_expired`).",
-    412: "If-Match names another result (`precondition_failed`).",
+    412: "If-Match names another result, or a job, which has no ETag (`precondition_failed`).",
     413: "Over a limit of /v1/info (`too_many_bytes`, `too_many_points`, `too_large`).",
     415: "No format recognises the file (`unknown_format`, `missing_dependency`).",
     416: "No byte of the result is in the range (`range_not_satisfiable`).",

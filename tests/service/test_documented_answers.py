@@ -65,6 +65,7 @@ ASKED: tuple[tuple[str, str, str, dict[str, str], bytes | None, int], ...] = (
     ("GET", RESULT, "", {"If-None-Match": "*"}, None, 304),
     ("HEAD", RESULT, "", {"If-None-Match": "*"}, None, 304),
     ("GET", RESULT, "", {"If-Match": '"x"'}, None, 412),
+    ("DELETE", "/jobs/{id}", "", {"If-Match": '"x"'}, None, 412),
     ("GET", RESULT, "", {"Range": "bytes=999-"}, None, 416),
     ("POST", "/jobs/{id}/cancel", "", {}, None, 200),
     ("DELETE", "/jobs/{id}", "", {}, None, 204),

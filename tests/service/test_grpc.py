@@ -194,6 +194,13 @@ def test_a_file_that_is_said_to_be_too_large_is_refused_before_it_comes(stub: An
     assert (status, info.reason) == ("INVALID_ARGUMENT", "TOO_MANY_BYTES")
 
 
+def test_two_idempotency_keys_are_refused(stub: Any) -> None:
+    config = parts(pb.CreateJobRequest, pb.JobConfig(filename="cloud.npy"), SMALL)
+    keys = [("idempotency-key", key) for key in ("one", "other")]
+    status, info = error_of(lambda: stub.CreateJob(config, metadata=keys))
+    assert (status, info.reason) == ("INVALID_ARGUMENT", "INVALID_REQUEST")
+
+
 @pytest.mark.parametrize("size", [2**20 + 5000, 2**22])
 def test_a_message_that_is_too_large_is_refused_with_its_code(channel: Any, stub: Any, size: int) -> None:
     """As of a client that sends its file in one: gRPC's own answer has no code, and is for what is larger still."""

@@ -164,6 +164,24 @@ def test_an_idempotency_key_stands_for_one_job_also_when_all_come_at_once(http: 
     assert http.post("/denoise", content=SMALL, headers={"Idempotency-Key": "k" * 256}).status_code == 400
 
 
+def test_two_idempotency_keys_are_refused(http: httpx2.Client) -> None:
+    """The first one counted: a repeat whose lines come in another order would have made another job."""
+    keys = [("Idempotency-Key", key) for key in ("one", "other")]
+    answer = http.post("/jobs?iterations=1", content=SMALL, headers=keys)
+    assert (answer.status_code, answer.json()["code"]) == (400, "invalid_request")
+    assert answer.json()["detail"] == "Idempotency-Key is said 2 times; which one is meant?"
+
+
+@pytest.mark.parametrize("named", ['"x"', "", '"x", W/"*"', '"*"'])
+def test_a_job_is_not_deleted_where_if_match_names_something_else(http: httpx2.Client, named: str) -> None:
+    """It was deleted whatever the request said of when it may be (RFC 9110, 13.1.1)."""
+    id = http.post("/jobs?iterations=1", content=SMALL).json()["id"]
+    answer = http.delete(f"/jobs/{id}", headers={"If-Match": named})
+    assert (answer.status_code, answer.json()["code"]) == (412, "precondition_failed")
+    assert http.get(f"/jobs/{id}").status_code == 200
+    assert http.delete(f"/jobs/{id}", headers={"If-Match": "*"}).status_code == 204
+
+
 def test_prefer_respond_async_and_wait_give_the_job_instead_of_a_timeout(http: httpx2.Client) -> None:
     for prefer in ("respond-async", "wait=0"):
         answer = http.post("/denoise?iterations=10", content=LARGE, headers={"Prefer": prefer})
