@@ -88,7 +88,7 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
                 return
             if _TWO_LENGTHS.issubset(name for name, _ in self.headers):
                 self.headers.append(_CLOSE)
-            self.cycle.default_headers = _AsOfNow(self.server_state)  # type: ignore[assignment]
+            self.cycle.default_headers = _AsItBegins(self.server_state, self.conn)  # type: ignore[assignment]
             self.cycle.transport = _Answering(self.transport, close=self._close_behind)  # type: ignore[assignment]
 
         def _close_behind(self) -> None:
@@ -129,14 +129,19 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
     return Connection
 
 
-class _AsOfNow:
-    """The headers of every answer, when it begins: uvicorn takes its Date when the request came, minutes before."""
+class _AsItBegins:
+    """The headers of every answer, when it begins: uvicorn takes its Date when the request came, minutes before.
 
-    def __init__(self, state: ServerState) -> None:
-        self._state = state
+    Whose client waits to be asked for its body (`Expect: 100-continue`), and is refused, is told that no other request
+    is taken: it may leave the body out, and then the next one would be read as that (RFC 9110, 10.1.1).
+    """
+
+    def __init__(self, state: ServerState, conn: h11.Connection) -> None:
+        self._state, self._conn = state, conn
 
     def __add__(self, own: list[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
-        return self._state.default_headers + own
+        close = [_CLOSE] if self._conn.they_are_waiting_for_100_continue else []
+        return self._state.default_headers + own + close
 
 
 class _Answering:

@@ -138,6 +138,44 @@ def test_one_that_closes_behind_an_early_answer_still_takes_the_body_and_then_en
     play(scenario)
 
 
+def test_one_whose_body_was_not_asked_for_is_closed_behind_its_answer(tmp_path: Path) -> None:
+    """Apache's client sends the next request there, and no body: it was read as that, and what followed was 400."""
+
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(REFUSED)
+            answer = await reader.readuntil(b"}")
+            assert b"connection: close" not in answer  # this one sends its body
+            writer.close()
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(REFUSED.replace(b"1000", b"1000\r\nExpect: 100-continue"))
+            answer = await asyncio.wait_for(reader.readuntil(b"}"), timeout=10)
+            assert answer.startswith(b"HTTP/1.1 404 ")
+            assert b"connection: close" in answer
+            writer.write(GOOD)
+            assert await asyncio.wait_for(reader.read(), timeout=10) == b""  # to the end, without another answer
+            writer.close()
+
+    play(scenario)
+
+
+def test_one_whose_body_was_asked_for_is_kept(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with serving(tmp_path, willing()) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            head, body = POST.split(b"\r\n\r\n", 1)
+            writer.write(head + b"\r\nExpect: 100-continue\r\n\r\n")
+            assert await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), timeout=10) == b"HTTP/1.1 100 Continue\r\n\r\n"
+            writer.write(body)
+            assert b"connection: close" not in await asyncio.wait_for(reader.readuntil(b"the result"), timeout=10)
+            writer.write(GOOD)
+            assert b"ready" in await asyncio.wait_for(reader.readuntil(b"}"), timeout=10)
+            writer.close()
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_one_that_waits_for_an_answer_is_not(tmp_path: Path, together: bool) -> None:
     async def scenario() -> None:
