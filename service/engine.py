@@ -267,8 +267,7 @@ class Engine:
     async def events(self, id: str, *, owner: str = "", after: int = 0) -> AsyncGenerator[JobEvent, None]:
         """Yield what happened behind event `after`, and then what happens, until `completed`, which has the job.
 
-        Raises ServerBusy where this server ends first, and NotFound where the job is deleted, also if its id is used
-        again.
+        Raises ServerBusy where this server ends first, NotFound where the job is deleted, also if its id is used again.
         """
         folder: str | None = None
         while True:
@@ -276,10 +275,11 @@ class Engine:
             record = await self._same(id, owner, folder)
             folder = record.folder
             events = await self._call(JobStore.events, folder, after)
+            if events and events[-1].kind == "completed":
+                ended = record if record.finished else await self._same(id, owner, folder)
+                events[-1] = replace(events[-1], job=ended)
             for event in events:
                 after = event.seq
-                if event.kind == "completed":
-                    event = replace(event, job=await self._same(id, owner, folder))
                 yield event
             if record.finished:
                 if not events:  # deleted between the two looks, it would seem to have told its end
