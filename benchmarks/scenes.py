@@ -1,12 +1,14 @@
-"""Filter scenes that are known exactly, as five scanners see them; how far points lie from the truth, part by part.
+"""Filter scenes that are known exactly, as six scanners see them; how far points lie from the truth, part by part.
 
-python -m benchmarks.scenes [lidar mobile aerial depth raster] [--noise 1.0] [--iterations auto] [--json FILE]
+python -m benchmarks.scenes [lidar mobile aerial depth disparity raster] [--noise 1.0] [--json FILE]
 
 A street (ground, kerbs, walls with sills, cars, poles, railings, wires, leaves) and a room, of boxes, rods and balls.
 Beams meet them exactly; noise is along the beam: 0.02 m for a spinning LiDAR of 64 rings and for a profile scanner
 driven through the street, 0.03 m from the air, and 0.0012 + 0.0019 (z - 0.4)^2 m at depth z for a depth camera (Nguyen,
-Izadi, Lovell 2012, axial noise of the Kinect). A raster has heights of hills, every metre, with 0.6 m of noise in
-height alone. --noise multiplies it.
+Izadi, Lovell 2012, axial noise of the Kinect). Another one, turned by 25 degrees, tells depths apart by whole
+disparities alone, 0.00285 z^2 m apart, and has half of that as noise (Khoshelham, Elberink 2012); its points are in the
+camera's frame, as such files are. A raster has heights of hills, every metre, with 0.6 m of noise in height
+alone. --noise multiplies it.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from benchmarks.command import errors_in_one_line, file_to_write, noise_level, positive
 from straightpcf.model.filter import load_filter
@@ -29,6 +32,7 @@ from straightpcf.points.options import DenoiseOptions
 __all__ = ["SCANNERS", "Part", "Scan", "distance_to", "room", "street"]
 
 Floats = npt.NDArray[np.float64]
+_DISPARITY = 0.00285  # 1 / m: depths that a Kinect tells apart are this times their square apart
 _LEAST = 30  # points of a part that make a row of the table
 
 
@@ -145,6 +149,23 @@ class Hills(Part):
         height, steep = self.height(xyz[:, 0], xyz[:, 1])
         above: Floats = (xyz[:, 2] - height) / np.hypot(1, steep)
         return above
+
+
+@dataclass(frozen=True)
+class Seen(Part):
+    """A body in the frame of a camera: turn (3, 3) and eye (3,) take a place in that to one in the scene."""
+
+    body: Part
+    turn: Floats
+    eye: Floats
+
+    def meet(self, origin: Floats, beam: Floats) -> Floats:
+        """Meet the body in the scene."""
+        return self.body.meet(origin @ self.turn.T + self.eye, beam @ self.turn.T)
+
+    def distance(self, xyz: Floats) -> Floats:
+        """Measure in the scene."""
+        return self.body.distance(xyz @ self.turn.T + self.eye)
 
 
 def street(seed: int = 0) -> list[Part]:
@@ -270,6 +291,20 @@ def _depth(noise: float) -> Scan:
     )
 
 
+def _disparity(noise: float) -> Scan:
+    turn = Rotation.from_euler("zx", [25, -12], degrees=True).as_matrix()
+    parts: list[Part] = [Seen(part.name, part, turn, np.array([0, 0, 1.3])) for part in room()]
+    column, row = _grid(np.arange(0, 640, 1.5), np.arange(0, 480, 1.5))
+    beam = np.stack([(column - 320) / 525, np.ones_like(column), -(row - 240) / 525], axis=1)
+    scan = _scan(parts, np.zeros(3), beam, 8.0, lambda xyz: np.zeros(len(xyz)))
+    depth = scan.clean[:, 1]
+    disparity = 1 / (_DISPARITY * depth) + 0.5 * noise * np.random.default_rng(1).standard_normal(len(depth))
+    told = 1 / (_DISPARITY * np.maximum(1, np.round(disparity)))
+    noisy = scan.clean * (told / depth)[:, None]
+    noisy[:, 1] = told  # to the bit, as a depth image has it
+    return Scan(parts, scan.clean, noisy, scan.part)
+
+
 def _raster(noise: float) -> Scan:
     x, y = _grid(np.arange(-50, 50, 1.0), np.arange(-50, 50, 1.0))
     down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (len(x), 3))
@@ -282,6 +317,7 @@ SCANNERS: dict[str, Callable[[float], Scan]] = {
     "mobile": _mobile,
     "aerial": _aerial,
     "depth": _depth,
+    "disparity": _disparity,
     "raster": _raster,
 }
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
+from straightpcf.model.layers import Layers
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated
@@ -32,6 +33,7 @@ __all__ = ["MIN_POINTS", "DenoiseResult", "FinishedPatch", "Run"]
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
 # Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/filter.md, "Few points").
 _FEW_POINTS = 500
+_PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 _HEARD, _MOVED = 7, 13  # what a pass takes until all patches have been heard, and from there on, in parts of its time
@@ -100,7 +102,8 @@ class Run:
         self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held_back = np.zeros(len(self.moved), dtype=bool)
-        self.voxel = 0.0  # the edge of a cell, in the unit-ball frame, where the points are a bent surface's voxels
+        self.steps = ""  # what is said of points that are steps, and were moved to anywhere in these
+        self.layers: Layers | None = None  # that the points lie in, as a depth camera's
         self.readings: list[Reading] = []  # before each pass, and after the last
         self._rounds = ROUNDS  # of spreading, before each pass but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
@@ -140,10 +143,9 @@ class Run:
             positions += spread_step
             tiling, self._first = self._first or self._tiling(positions, tiles), None
             reading = self.reader.read(positions, tiling, self.readings[0] if self.readings else None)
-            if not self.readings and (edge := self._edge_of_steps(reading)):
-                self.voxel = edge
-                self.moved += within_voxels(len(positions), edge, self.options.seed)
-                positions += self.moved
+            if not self.readings and (within := self._within_steps(positions, tiling, reading)) is not None:
+                self.moved += within
+                positions += within
                 tiling = self._tiling(positions, tiles)
                 reading = self.reader.read(positions, tiling, None)
             self.readings.append(reading)
@@ -151,17 +153,30 @@ class Run:
             if left == 0:
                 self.noise_after = self._noise_left(tiles)
                 return
-            self.readings[-1] = self.reader.with_walls(positions, reading, self.readings[0])
+            if self.layers is None or not self.layers.wide:  # a pass leaves layers of them that look like walls
+                self.readings[-1] = self.reader.with_walls(positions, reading, self.readings[0])
             self.iterations += 1
             self.moved += spread_step
             yield from self._pass(positions, tiling, left)
 
-    def _edge_of_steps(self, reading: Reading) -> float:
-        """Return the edge of a cell where the first reading is of the steps of a bent object's voxels, else 0."""
-        if reading.scene or not self.filter.zoom:
-            return 0.0
-        edge = edge_of_voxels(self.points.xyz) / self.frame.radius
-        return edge if are_steps(edge, reading.noise_std) else 0.0
+    def _within_steps(
+        self, positions: npt.NDArray[np.float64], tiling: Tiling, reading: Reading
+    ) -> npt.NDArray[np.float64] | None:
+        """Return how far points go, (N, 3), to anywhere in their steps: a bent object's voxels, or wide layers."""
+        if not self.filter.zoom:
+            return None
+        if edge := 0.0 if reading.scene else edge_of_voxels(self.points.xyz) / self.frame.radius:
+            if not are_steps(edge, reading.noise_std):
+                return None
+            self.steps = "the points are voxels: each was taken to be anywhere in its cell"
+            return within_voxels(len(positions), edge, self.options.seed)
+        probes, _ = tiling.probes()
+        raster = reading.height_axis is not None
+        self.layers = layers = Layers.of(positions, probes, raster=raster, survey=self.filter.processor.survey)
+        if layers is None or not layers.wide:
+            return None
+        self.steps = f"the points lie in layers along {'xyz'[layers.axis]}: each was taken to be anywhere in its own"
+        return layers.anywhere_within(self.options.seed)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -177,8 +192,8 @@ class Run:
             warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
         if held_back := np.count_nonzero(self.held_back[self.points.inverse]):
             warnings.append(f"{held_back} points are on walls closer together than points are, and were held back")
-        if self.voxel:
-            warnings.append("the points are voxels: each was taken to be anywhere in its cell")
+        if self.steps:
+            warnings.append(self.steps)
         found = len(self.points.xyz)
         counted = f"{found} points" if found == len(self.rows) else f"all points lie in {found} places"
         if self.frame.radius == 0.0:
@@ -212,13 +227,14 @@ class Run:
         if len(self.points.xyz) < _FEW_POINTS:
             return 1 - self.iterations
         first, calibration = self.readings[0], self.filter.calibration
-        return (calibration.of_scenes() if first.scene else calibration).passes_left(
+        left = (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
             thin_walls=first.sampling.thin_walls,
             shown_walls=self._rounds > ROUNDS,
             thicknesses=[reading.thickness for reading in self.readings],
         )
+        return max(left, _PASSES_OF_LAYERS - self.iterations) if self.layers else left
 
     def _spread_step(
         self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None

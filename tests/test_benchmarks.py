@@ -151,6 +151,17 @@ def test_a_raster_of_hills_has_its_noise_in_height_alone() -> None:
     assert scenes.distance_to(scan.parts, some) == pytest.approx(nearest, rel=0.02)
 
 
+def test_a_depth_camera_tells_depths_apart_by_disparities() -> None:
+    scan = scenes.SCANNERS["disparity"](1.0)
+    assert np.abs(scenes.distance_to(scan.parts, scan.clean)).max() < 1e-9
+    assert len(np.unique(scan.noisy[:, 1])) < 200
+    np.testing.assert_allclose(scan.noisy / scan.noisy[:, 1:2], scan.clean / scan.clean[:, 1:2])  # on its beam
+    far = np.abs(scan.clean[:, 1] - 3) < 0.1
+    step = 0.00285 * 9
+    off = (scan.noisy - scan.clean)[far, 1]
+    assert off.std() == pytest.approx(np.hypot(step / 2, step / np.sqrt(12)), rel=0.1)
+
+
 def test_weights_of_a_state_keep_what_ships_beside_their_velocities(tmp_path: Path) -> None:
     shipped, made = DEFAULT_WEIGHTS, tmp_path / "weights.safetensors"
     printed("calibrate", "--state", shipped, "--mean", shipped, "--keep", shipped, "--out", made)

@@ -35,6 +35,22 @@ def test_heights_over_a_grid_are_a_raster_whichever_axis_they_are_along(up: int,
     assert height_axis(cloud[np.random.default_rng(1).random(len(cloud)) < 0.7]) == up  # cells without a height
 
 
+@pytest.mark.parametrize("step", [0.01, 0.1, 1.0])
+def test_rounded_heights_are_a_raster_too(step: float) -> None:
+    cloud = hills(60, noise_std=0.3)
+    cloud[:, 2] = step * np.round(cloud[:, 2] / step)
+    assert height_axis(cloud) == 2
+
+
+def test_heights_in_few_steps_come_nearer_to_the_hills() -> None:
+    cloud = hills(60)
+    cloud[:, 2] = 2 * np.round(cloud[:, 2] / 2)
+    result = load_filter(threads=2).denoise(cloud)
+    assert rms_off_the_hills(result.xyz) < 0.6 * rms_off_the_hills(cloud)
+    assert result.iterations >= 3
+    np.testing.assert_array_equal(result.xyz[:, :2], cloud[:, :2])
+
+
 @pytest.mark.parametrize("side", [45, 100, 200, 201, 1000])
 def test_a_raster_is_one_however_large(side: int) -> None:
     assert height_axis(hills(side)) == 2
@@ -46,7 +62,6 @@ def test_other_clouds_are_no_rasters() -> None:
     assert height_axis(turned) is None
     assert height_axis(noisy(cloud, 0.01)) is None
     assert height_axis(np.concatenate([cloud, cloud + np.array([0, 0, 4])])) is None  # two heights in a cell
-    assert height_axis(np.round(cloud)) is None  # steps: voxels
     assert height_axis(hills(50) * [1, 1, 0]) is None  # no heights at all
     x, y = np.unique(np.round(np.random.default_rng(0).uniform(0, 40, (3000, 2)), 1), axis=0).T
     assert height_axis(np.column_stack([x, y, height(x, y)])) is None  # a grid, and nearly all of it empty
