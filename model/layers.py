@@ -61,6 +61,8 @@ class Layers:
         if axis not in axes or shares[axis] < _LAYERED_SHARE or others.max() > _OTHER_AXES * shares[axis]:
             return None
         lines, layer = np.unique(xyz[:, axis], return_inverse=True)
+        if len(lines) < _FEWEST_LAYERS:
+            return None
         widths, seen = _widths(lines), layered[:, axis]
         at = np.searchsorted(lines, where[seen, axis])
         in_spacings = float(np.median(widths[at] / spacings[seen]))

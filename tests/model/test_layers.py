@@ -106,8 +106,23 @@ def box() -> Floats:
         floor_and_ball(),
         box(),
         np.round(box(), 2),
+        sphere(5000) * [1, 1, 0],
+        np.concatenate([sphere(5000) * [1, 1, 0], sphere(5000) * [1, 1, 0] + [0, 0, 0.03]]),
     ],
-    ids=["sphere", "noise", "rounded", "voxels", "stairs", "slices", "profiles", "floor", "box", "rounded-box"],
+    ids=[
+        "sphere",
+        "noise",
+        "rounded",
+        "voxels",
+        "stairs",
+        "slices",
+        "profiles",
+        "floor",
+        "box",
+        "rounded-box",
+        "flat",
+        "two",
+    ],
 )
 def test_other_clouds_have_no_layers(cloud: Floats) -> None:
     assert layers_of(cloud) is None
