@@ -1,6 +1,6 @@
 """Filter scenes that are known exactly, as six scanners see them; how far points lie from the truth, part by part.
 
-python -m benchmarks.scenes [lidar mobile aerial depth disparity raster] [--noise 1.0] [--json FILE]
+python -m benchmarks.scenes [lidar ... disparity raster] [--noise 1.0] [--iterations auto] [--json FILE]
 
 A street (ground, kerbs, walls with sills, cars, poles, railings, wires, leaves) and a room, of boxes, rods and balls.
 Beams meet them exactly; noise is along the beam: 0.02 m for a spinning LiDAR of 64 rings and for a profile scanner

@@ -22,10 +22,10 @@ def height_axis(xyz: Floats) -> int | None:
 
     On a grid along the two other axes, one in a cell. The heights may be rounded, to metres as well.
     """
-    gridded = [axis for axis in range(3) if repeats(xyz[:, axis], _POINTS_A_LINE)]
-    for plane in combinations(gridded, 2):
+    cells = {axis: _cells(xyz[:, axis]) for axis in range(3) if repeats(xyz[:, axis], _POINTS_A_LINE)}
+    for plane in combinations(cells, 2):
         (up,) = set(range(3)) - set(plane)
-        first, second = (_cells(xyz[:, axis]) for axis in plane)
+        first, second = (cells[axis] for axis in plane)
         if first is None or second is None or np.ptp(xyz[:, up]) == 0.0:
             continue
         rows, columns = int(first.max()) + 1, int(second.max()) + 1

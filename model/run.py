@@ -143,7 +143,7 @@ class Run:
             positions += spread_step
             tiling, self._first = self._first or self._tiling(positions, tiles), None
             reading = self.reader.read(positions, tiling, self.readings[0] if self.readings else None)
-            if not self.readings and (within := self._within_steps(positions, tiling, reading)) is not None:
+            if not self.readings and (within := self._within_steps(positions, reading)) is not None:
                 self.moved += within
                 positions += within
                 tiling = self._tiling(positions, tiles)
@@ -159,20 +159,17 @@ class Run:
             self.moved += spread_step
             yield from self._pass(positions, tiling, left)
 
-    def _within_steps(
-        self, positions: npt.NDArray[np.float64], tiling: Tiling, reading: Reading
-    ) -> npt.NDArray[np.float64] | None:
+    def _within_steps(self, positions: npt.NDArray[np.float64], reading: Reading) -> npt.NDArray[np.float64] | None:
         """Return how far points go, (N, 3), to anywhere in their steps: a bent object's voxels, or wide layers."""
-        if not self.filter.zoom:
+        if not self.filter.zoom or reading.probes is None:
             return None
         if edge := 0.0 if reading.scene else edge_of_voxels(self.points.xyz) / self.frame.radius:
             if not are_steps(edge, reading.noise_std):
                 return None
             self.steps = "the points are voxels: each was taken to be anywhere in its cell"
             return within_voxels(len(positions), edge, self.options.seed)
-        probes, _ = tiling.probes()
         raster = reading.height_axis is not None
-        self.layers = layers = Layers.of(positions, probes, raster=raster, survey=self.filter.processor.survey)
+        self.layers = layers = Layers.of(positions, reading.probes, raster=raster, survey=self.filter.processor.survey)
         if layers is None or not layers.wide:
             return None
         self.steps = f"the points lie in layers along {'xyz'[layers.axis]}: each was taken to be anywhere in its own"

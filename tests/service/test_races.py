@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,18 @@ def test_a_job_that_is_deleted_while_its_file_is_on_its_way_is_none(tmp_path: Pa
     play(scenario)
 
 
+@asynccontextmanager
+async def with_a_finished_job(data_dir: Path) -> AsyncIterator[tuple[Engine, ObedientBackend, httpx2.AsyncClient]]:
+    backend = willing()
+    async with (
+        serving(data_dir, backend) as (engine, host, port),
+        httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
+    ):
+        await http.put("/jobs/mine?filename=a.xyz", content=CLOUD)
+        await engine.wait("mine")
+        yield engine, backend, http
+
+
 def replacing(engine: Engine, backend: ObedientBackend, moment: Callable[..., Any], *, call: int = 1) -> list[str]:
     """Give a finished job's id to another one around the call of a store's method; return the folders of both."""
     through, folders, calls = engine._call, list[str](), 0
@@ -165,13 +178,7 @@ def test_what_is_asked_of_a_job_whose_id_is_anothers_by_then_is_not_found(
     """The other one was deleted in its place, shown for it, or a result it has not yet was a fault of the server."""
 
     async def scenario() -> None:
-        backend = willing()
-        async with (
-            serving(tmp_path, backend) as (engine, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
-            await http.put("/jobs/mine?filename=a.xyz", content=CLOUD)
-            await engine.wait("mine")
+        async with with_a_finished_job(tmp_path) as (engine, backend, http):
             folders = replacing(engine, backend, moment)
             answer = await http.request(method, f"/jobs/mine{path}")
             assert (answer.status_code, answer.json()["code"]) == (404, "not_found")
@@ -185,13 +192,7 @@ def test_what_is_asked_of_a_job_whose_id_is_anothers_by_then_is_not_found(
 
 def test_a_jobs_last_event_brings_no_other_job_that_has_its_id_by_then(tmp_path: Path) -> None:
     async def scenario() -> None:
-        backend = willing()
-        async with (
-            serving(tmp_path, backend) as (engine, host, port),
-            httpx2.AsyncClient(base_url=f"http://{host}:{port}") as http,
-        ):
-            await http.put("/jobs/mine?filename=a.xyz", content=CLOUD)
-            await engine.wait("mine")
+        async with with_a_finished_job(tmp_path) as (engine, backend, http):
             replacing(engine, backend, JobStore.events, call=2)
             told = (await http.get("/jobs/mine/events")).text
             completed = json.loads(told.partition("event: completed\ndata: ")[2])
