@@ -18,6 +18,7 @@ __all__ = ["watch_folder"]
 
 LOOK_SECONDS = 1.0
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+_SUFFIXES = frozenset(suffix for format in FORMATS for suffix in format.suffixes)
 
 Outcome = tuple[Path, Any | Exception]
 Stamp = tuple[int, int]
@@ -37,63 +38,85 @@ def watch_folder(
     may be, is said once, and waited for. Yields each outcome. once: look once, and end. Raises Unauthorized: what a
     server that wants another key says of one file it says of all.
     """
-    suffixes = {suffix for format in FORMATS for suffix in format.suffixes}
-    tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
-    full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
-    lost: dict[Path, Stamp] = {}
-    before: dict[Path, Stamp] = {}
-    is_away = False
+    looks, is_away = _Looks(target, denoise, once=once), False
     while True:
         try:
-            inside = sorted(folder.iterdir())
+            seen = _clouds_in(folder)
         except OSError as error:
             if once:
                 raise
             if not is_away:
                 yield folder, error
             is_away = True
-            time.sleep(LOOK_SECONDS)
-            continue
-        is_away = False
-        seen = {
-            path: stamp
-            for path in inside
-            if path.suffix.lower() in suffixes and not path.name.startswith(".") and (stamp := _stamp(path))
-        }
-        for path, stamp in seen.items():
-            result = target / path.name
-            if tried.get(path) == stamp or _is_done(path, result, stamp) or _is_full(target, full.get(path)):
-                continue
-            if not once and before.get(path) != stamp:
-                continue  # perhaps it still grows
-            now = _stamp(path)  # its turn may come long after the look
-            if now is None or (now != stamp and not once):
-                continue
-            stamp = now
-            try:
-                report = denoise(path, result)
-                os.utime(result, ns=(stamp[1], stamp[1]))
-            except Unauthorized:
-                raise
-            except (ConnectionFailed, RequestTimeout, ServerBusy) as error:
-                yield path, error
-            except Exception as error:
-                if isinstance(error, NotFound | JobExpired) and lost.get(path) != stamp:
-                    lost[path] = stamp
-                elif isinstance(error, OSError) and error.errno in _NO_ROOM:
-                    full[path] = shutil.disk_usage(target).free
-                elif not target.is_dir():
-                    full[path] = -1
-                elif _stamp(path) is not None:  # else it is gone, or its folder is away: it may come back as it was
-                    tried[path] = stamp
-                yield path, error
-            else:
-                tried[path] = stamp
-                yield path, report
-        if once:
-            return
-        before = seen
+        else:
+            is_away = False
+            yield from looks.take(seen)
+            if once:
+                return
         time.sleep(LOOK_SECONDS)
+
+
+class _Looks:
+    """Remember, from look to look, what became of each cloud."""
+
+    def __init__(self, target: Path, denoise: Callable[[Path, Path], Any], *, once: bool) -> None:
+        self._target, self._denoise, self._once = target, denoise, once
+        self._tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
+        self._full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
+        self._lost: dict[Path, Stamp] = {}
+        self._before: dict[Path, Stamp] = {}
+
+    def take(self, seen: dict[Path, Stamp]) -> Iterator[Outcome]:
+        """Denoise those of the clouds in a folder whose turn it is."""
+        for path, stamp in seen.items():
+            if (current := self._stamp_to_take(path, stamp)) is not None:
+                yield path, self._outcome(path, current)
+        self._before = seen
+
+    def _stamp_to_take(self, path: Path, stamp: Stamp) -> Stamp | None:
+        """Return the stamp of a cloud as it is now, None where it is not its turn."""
+        if self._tried.get(path) == stamp or _is_done(path, self._target / path.name, stamp):
+            return None
+        if _is_full(self._target, self._full.get(path)):
+            return None
+        if self._once:
+            return _stamp(path)
+        # It may still grow, and its turn may come long after the look.
+        return stamp if self._before.get(path) == stamp == _stamp(path) else None
+
+    def _outcome(self, path: Path, stamp: Stamp) -> Any | Exception:
+        result = self._target / path.name
+        try:
+            report = self._denoise(path, result)
+            os.utime(result, ns=(stamp[1], stamp[1]))
+        except Unauthorized:
+            raise
+        except Exception as error:
+            self._note_failure(path, stamp, error)
+            return error
+        self._tried[path] = stamp
+        return report
+
+    def _note_failure(self, path: Path, stamp: Stamp, error: Exception) -> None:
+        if isinstance(error, ConnectionFailed | RequestTimeout | ServerBusy):
+            return
+        if isinstance(error, NotFound | JobExpired) and self._lost.get(path) != stamp:
+            self._lost[path] = stamp
+        elif isinstance(error, OSError) and error.errno in _NO_ROOM:
+            self._full[path] = shutil.disk_usage(self._target).free
+        elif not self._target.is_dir():
+            self._full[path] = -1
+        elif _stamp(path) is not None:  # else it is gone, or its folder is away: it may come back as it was
+            self._tried[path] = stamp
+
+
+def _clouds_in(folder: Path) -> dict[Path, Stamp]:
+    """Return the stamps of a folder's clouds, by name; raises OSError where the folder is away."""
+    return {
+        path: stamp
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in _SUFFIXES and not path.name.startswith(".") and (stamp := _stamp(path))
+    }
 
 
 def _stamp(path: Path) -> Stamp | None:
