@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,21 @@ from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import MAX_FIELDS, PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
-from straightpcf.points.formats.text import as_integers, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.text import (
+    Lines,
+    as_integers,
+    as_numbers,
+    blocks,
+    refuse_binary,
+    replaced,
+    shown,
+)
 
 __all__ = ["Pcd"]
 
 _MOST_LOST = 1e-6  # of a new file's extent, by float positions; those of an object or a frame lose 1e-7
 _FLOATS = frozenset(("intensity", "curvature", *NORMALS[1]))  # of PCL's point types: until 1.15 it reads no other there
+_Tokens = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]  # where each begins, and where it ends
 _TYPES = ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")
 
 
@@ -38,7 +48,7 @@ class PcdSource:
     raw: bytes
     header: PcdHeader
     xyz: npt.NDArray[np.float64]
-    tokens: dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] | None = None
+    tokens: dict[str, _Tokens] | None = None
     unpacked: bytes | None = None
 
 
@@ -153,47 +163,17 @@ def _repacked(
 
 
 def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
-    refuse_binary(raw, header.size)
-    width = sum(field.count for field in header.fields)
-    check_room(
-        max(2 * width * header.points - 1, 0),
-        len(raw) - header.size,
-        what=f"PCD data of {header.points} points with {width} values",
-    )
     parts: dict[str, list[npt.NDArray[Any]]] = {field.label: [] for field in header.fields}
-    kept = WRITTEN.intersection(field.label for field in header.fields)
-    tokens: dict[str, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]] = {name: [] for name in kept}
-    left, line = header.points, header.lines + 1
-    for lines, _ in blocks(raw, header.size):
-        filled = np.flatnonzero(lines.counts)  # PCL skips blank lines
-        if len(filled) > left and lines.counts[filled[left]] == width:
-            raise MalformedFile(f"PCD POINTS is {header.points}, and line {line + filled[left]} is one more")
-        filled = filled[:left]
-        rows, numbers = lines.pick(filled), line + filled
-        line += len(lines)
-        wrong = rows.counts != width
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise MalformedFile(f"line {numbers[row]} has {rows.counts[row]} values, the PCD fields have {width}")
-        columns, at = {}, 0
+    tokens: dict[str, list[_Tokens]] = {name: [] for name in WRITTEN.intersection(parts)}
+    for rows, numbers in _ascii_rows(raw, header):
+        at = 0
         for field in header.fields:
             index = (rows.first[:, None] + np.arange(at, at + field.count)).reshape(-1)
-            columns[field.label] = rows.starts[index], rows.ends[index]
-            first, last = columns[field.label]
-            values, bad = _text_values(raw, first, last, field)
-            if bad is not None:
-                token = shown(raw[first[bad] : last[bad]])
-                number = numbers[bad // field.count]
-                raise MalformedFile(f"line {number}: {field.label} is {token}, no {field.dtype.name}")
-            parts[field.label].append(values if field.count == 1 else values.reshape(-1, field.count))
+            first, last = rows.starts[index], rows.ends[index]
+            parts[field.label].append(_text_values(raw, first, last, field, numbers))
+            if field.label in tokens:
+                tokens[field.label].append((first, last))
             at += field.count
-        for name in kept:
-            tokens[name].append(columns[name])
-        left -= len(rows)
-    if left:
-        raise MalformedFile(
-            f"PCD POINTS is {header.points}, the file ends after {header.points - left}: it is truncated"
-        )
     found = {
         field.label: np.concatenate(parts[field.label]) if parts[field.label] else np.empty(0, field.dtype)
         for field in header.fields
@@ -205,14 +185,57 @@ def _read_ascii(raw: bytes, header: PcdHeader) -> PointCloud:
     xyz = widened([found[axis] for axis in header.axes])
     none = np.empty(0, np.int64)
     where = {
-        name: (np.concatenate([none, *(p[0] for p in parts)]), np.concatenate([none, *(p[1] for p in parts)]))
-        for name, parts in tokens.items()
+        name: (np.concatenate([none, *(p[0] for p in places)]), np.concatenate([none, *(p[1] for p in places)]))
+        for name, places in tokens.items()
     }
     source = PcdSource(raw, header, xyz.copy(), where)
     return PointCloud(xyz, _attributes(found, header), source, beside=header.beside)
 
 
+def _ascii_rows(raw: bytes, header: PcdHeader) -> Iterator[tuple[Lines, npt.NDArray[np.int64]]]:
+    """Yield the lines of points, some at a time, with their numbers; raises MalformedFile where they are no table."""
+    refuse_binary(raw, header.size)
+    width = sum(field.count for field in header.fields)
+    check_room(
+        max(2 * width * header.points - 1, 0),
+        len(raw) - header.size,
+        what=f"PCD data of {header.points} points with {width} values",
+    )
+    left, line = header.points, header.lines + 1
+    for lines, _ in blocks(raw, header.size):
+        filled = np.flatnonzero(lines.counts)  # PCL skips blank lines
+        if len(filled) > left and lines.counts[filled[left]] == width:
+            raise MalformedFile(f"PCD POINTS is {header.points}, and line {line + filled[left]} is one more")
+        filled = filled[:left]
+        rows, numbers = lines.pick(filled), line + filled
+        wrong = rows.counts != width
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise MalformedFile(f"line {numbers[row]} has {rows.counts[row]} values, the PCD fields have {width}")
+        yield rows, numbers
+        line, left = line + len(lines), left - len(rows)
+    if left:
+        raise MalformedFile(
+            f"PCD POINTS is {header.points}, the file ends after {header.points - left}: it is truncated"
+        )
+
+
 def _text_values(
+    raw: bytes,
+    first: npt.NDArray[np.int64],
+    last: npt.NDArray[np.int64],
+    field: PcdField,
+    numbers: npt.NDArray[np.int64],
+) -> npt.NDArray[Any]:
+    """Read the tokens of a field in lines of these numbers, (K,): (K,) or (K, COUNT)."""
+    values, bad = _as_numbers(raw, first, last, field)
+    if bad is not None:
+        token = shown(raw[first[bad] : last[bad]])
+        raise MalformedFile(f"line {numbers[bad // field.count]}: {field.label} is {token}, no {field.dtype.name}")
+    return values if field.count == 1 else values.reshape(-1, field.count)
+
+
+def _as_numbers(
     raw: bytes, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64], field: PcdField
 ) -> tuple[npt.NDArray[Any], int | None]:
     if field.dtype.kind == "f":
