@@ -21,6 +21,7 @@ from straightpcf.points.formats.las_layout import (
     dimensions,
     is_geographic,
     read_header,
+    record_bytes,
 )
 from straightpcf.points.formats.las_new import TAKEN, TYPES, as_dimensions, check_new, new_las, renamed
 from straightpcf.points.formats.laz_codec import check_packing, pack, packing_record, unpack
@@ -188,8 +189,7 @@ def _assembled(
     if compressed and old is not None and old.data == record:
         records = [entry.raw for entry in header.records]
     elif compressed:
-        prefix = struct.pack("<H16sHH32s", 0, LASZIP_ID[0], LASZIP_ID[1], len(record), b"straightpcf")
-        records = [*kept, prefix + record]
+        records = [*kept, record_bytes(LASZIP_ID, record, b"straightpcf")]
     begin = len(header.head) + sum(map(len, records)) + len(header.gap)
     points: bytes | memoryview = pack(rows, record, begin) if compressed else rows.reshape(-1).data
     after, follows_at = _follows(raw, header)

@@ -15,6 +15,7 @@ from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
 
 __all__ = [
+    "COPC_ID",
     "EXTRA_BYTES_ID",
     "LASZIP_ID",
     "LasDimension",
@@ -23,6 +24,7 @@ __all__ = [
     "dimensions",
     "is_geographic",
     "read_header",
+    "record_bytes",
     "standard_bytes",
     "standard_dimensions",
     "value_bytes",
@@ -182,6 +184,11 @@ def is_geographic(header: LasHeader) -> bool:
     keys = header.record(*_GEO_KEYS_ID)
     data = keys.data if keys is not None else b""
     return _GEOGRAPHIC in struct.iter_unpack("<4H", data[: len(data) // 8 * 8])
+
+
+def record_bytes(identity: tuple[bytes, int], data: bytes, description: bytes) -> bytes:
+    """Return a variable length record: its header of 54 bytes, and its data."""
+    return struct.pack("<H16sHH32s", 0, *identity, len(data), description) + data
 
 
 def _records(raw: bytes, at: int, count: int, limit: int) -> tuple[tuple[LasRecord, ...], int]:

@@ -13,7 +13,13 @@ import numpy.typing as npt
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.colours import RGB, in_16_bits
-from straightpcf.points.formats.las_layout import LasDimension, standard_bytes, standard_dimensions
+from straightpcf.points.formats.las_layout import (
+    EXTRA_BYTES_ID,
+    LasDimension,
+    record_bytes,
+    standard_bytes,
+    standard_dimensions,
+)
 from straightpcf.points.formats.positions import from_middle, rounding
 from straightpcf.points.formats.scalars import meant, scalar_columns
 
@@ -178,7 +184,7 @@ def _extra_bytes_record(extra: dict[str, npt.NDArray[Any]]) -> bytes:
         struct.pack("<2xBx32s156x", TYPES.index(values.dtype.str[1:]) + 1, name)
         for name, values in zip(_short_names(extra), extra.values(), strict=True)
     )
-    return struct.pack("<H16sHH32s", 0, b"LASF_Spec", 4, len(body), b"Extra Bytes Record") + body
+    return record_bytes(EXTRA_BYTES_ID, body, b"Extra Bytes Record")
 
 
 def _short_names(names: Iterable[str]) -> list[bytes]:

@@ -13,12 +13,12 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile, MissingDependency, UnsupportedCloud
 from straightpcf.points.formats.base import check_room, check_unpacked
-from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader, value_bytes
+from straightpcf.points.formats.las_layout import LASZIP_ID, LasHeader, standard_bytes, value_bytes
 
 __all__ = ["check_packing", "pack", "packing_record", "unpack"]
 
 VARIABLE_CHUNKS = 0xFFFFFFFF
-_WITH_WAVES = (4, 5, 9, 10)  # point formats
+_WITH_WAVES, _PACKED_ANEW = (4, 5, 9, 10), (0, 1, 2, 3, 6, 7, 8)  # point formats
 _TRIAL_POINTS = 50_000  # a chunk
 _STEP_BYTES = 4 << 20  # that are packed, and unpacked again to be compared, at a time
 _POINTWISE, _LAYERED = 2, 3
@@ -81,10 +81,9 @@ def packing_record(header: LasHeader) -> bytes:
         versions = [version for _, _, version in _items(record.data)]
         if chunk_size != VARIABLE_CHUNKS and min(versions) >= 2:
             return record.data
-    standard = {0: 20, 1: 28, 2: 26, 3: 34, 6: 30, 7: 36, 8: 38}
-    if header.point_format not in standard:
+    if header.point_format not in _PACKED_ANEW:
         raise UnsupportedCloud(f"LAS point format {header.point_format} cannot be packed as LAZ; write LAS")
-    extra = header.row_bytes - standard[header.point_format]
+    extra = header.row_bytes - standard_bytes(header.point_format)
     return bytes(lazrs.LazVlr.new_for_compression(header.point_format, extra).record_data())
 
 
