@@ -17,20 +17,20 @@ _AUTO_PASSES = 5  # the most that `auto` makes with the shipped weights
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Bound what is taken; the fields are those of `Settings`."""
+    """Bound what is taken; the fields are those of `Settings`, which has their defaults."""
 
     max_bytes: int
     max_points: int
-    max_jobs: int = 1000
-    max_queued_points: int = 200_000_000
-    max_jobs_per_key: int = 1000
-    max_spool_bytes: int = 50 * 2**30
-    min_free_bytes: int = 0
-    max_sync_seconds: float = 300.0
-    upload_idle_seconds: float = 60.0
-    result_ttl_seconds: float = 3600.0
-    row_ttl_seconds: float = 86400.0
-    shutdown_seconds: float = 30.0
+    max_jobs: int
+    max_queued_points: int
+    max_jobs_per_key: int
+    max_spool_bytes: int
+    min_free_bytes: int
+    max_sync_seconds: float
+    upload_idle_seconds: float
+    result_ttl_seconds: float
+    row_ttl_seconds: float
+    shutdown_seconds: float
 
     def check_bytes(self, size: int) -> None:
         """Raise TooManyBytes above the limit."""

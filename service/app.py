@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import os
 import resource
@@ -252,20 +253,7 @@ def _check_start(settings: Settings) -> None:
 
 
 def _limits(settings: Settings) -> Limits:
-    return Limits(
-        max_bytes=settings.max_bytes,
-        max_points=settings.max_points,
-        max_jobs=settings.max_jobs,
-        max_queued_points=settings.max_queued_points,
-        max_jobs_per_key=settings.max_jobs_per_key,
-        max_spool_bytes=settings.max_spool_bytes,
-        min_free_bytes=settings.min_free_bytes,
-        max_sync_seconds=settings.max_sync_seconds,
-        upload_idle_seconds=settings.upload_idle_seconds,
-        result_ttl_seconds=settings.result_ttl_seconds,
-        row_ttl_seconds=settings.row_ttl_seconds,
-        shutdown_seconds=settings.shutdown_seconds,
-    )
+    return Limits(**{limit.name: getattr(settings, limit.name) for limit in dataclasses.fields(Limits)})
 
 
 def _local_backend(settings: Settings) -> LocalBackend:

@@ -107,9 +107,8 @@ class Settings:
             if (path := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _at_home(name, path))
         for name in _POSITIVE:
-            value = getattr(self, name)
-            if value is not None and value <= 0:
-                raise InvalidOptions(f"{name} is {value}; it must be above 0")
+            if getattr(self, name) <= 0:
+                raise InvalidOptions(f"{name} is {getattr(self, name)}; it must be above 0")
         check_threads(self.threads)
         if self.tile_points is not None and self.tile_points < MIN_TILE_POINTS:
             raise InvalidOptions(f"tile_points is {self.tile_points}; it must be at least {MIN_TILE_POINTS}")

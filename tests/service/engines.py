@@ -6,6 +6,7 @@ import asyncio
 import sqlite3
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,17 @@ from straightpcf.service.admission import Limits
 from straightpcf.service.engine import Engine, JobRequest
 from straightpcf.service.jobs.record import JobRecord
 from straightpcf.service.jobs.store import JobStore
+from straightpcf.service.settings import Settings
 from tests.service.fakes import ObedientBackend
 
+SMALL: dict[str, Any] = {limit.name: getattr(Settings(), limit.name) for limit in fields(Limits)}
+SMALL |= {"max_bytes": 100, "max_points": 10, "min_free_bytes": 0, "shutdown_seconds": 0.0}
 Scenario = Callable[[Engine, ObedientBackend], Coroutine[Any, Any, None]]
 
 
 @asynccontextmanager
 async def running(folder: Path, backend: ObedientBackend, **limits: Any) -> AsyncIterator[Engine]:
-    engine = Engine(
-        backend,
-        limits=Limits(**{"max_bytes": 100, "max_points": 10, "shutdown_seconds": 0.0} | limits),
-        data_dir=folder,
-    )
+    engine = Engine(backend, limits=Limits(**SMALL | limits), data_dir=folder)
     await engine.start()
     try:
         yield engine
