@@ -132,48 +132,7 @@ class NoiseReader:
             settled = first is not None or axis is not None or not self._zoom
             if settled or not is_dense_object(reading.noise_std, probes.radii, len(positions)):
                 return reading
-        scales = patch_scales(probes.radii, scene=False)
-        distances = self._processor.distances(positions, probes, scales)
-        distance, known = float(np.median(distances)), dict(zip(numbers, distances.tolist(), strict=False))
-        noise = self._noise_std(distances, scales)
-        zoom, in_radii, high_noise, uneven, thickness = 1.0, 0.0, False, False, 0.0
-        parts: tuple[int, ...] = (1,)
-        if first is None:
-            sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
-            in_radii = noise_in_radii(noise, probes.radii)
-        else:
-            sampling = first.sampling
-            if first.noise_in_radii > DENSE_FROM_RADII:
-                thicknesses = self._processor.survey(positions, probes, _thickness_ratios)
-                thickness = float(np.median(np.concatenate(list(thicknesses))))
-        if self._zoom:
-            if first is None:
-                noise = self._reread(positions, tiling, noise)
-                zoom, parts = zoom_of(noise, probes.radii), parts_of(noise, probes.radii, len(positions))
-                uneven = _is_uneven(self.noise_stds(distances, scales), zoom)
-                radius = float(np.median(probes.radii))
-                high_noise = noise > HIGH_NOISE and self._has_high_noise(positions, tiling, noise, radius)
-            elif first.high_noise and noise > _REREAD_FROM * self._largest_noise:
-                zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
-        if uneven or parts != (1,):  # patches are shown in other sizes, or are others
-            known = {}
-        elif zoom != 1.0:
-            distances = self._processor.distances(positions, probes, patch_scales(probes.radii, scene=False, zoom=zoom))
-            known = dict(zip(numbers, distances.tolist(), strict=False))
-        return Reading(
-            distance,
-            noise,
-            False,
-            sampling,
-            zoom,
-            parts,
-            in_radii,
-            known,
-            high_noise=high_noise,
-            uneven=uneven,
-            probes=probes,
-            thickness=thickness,
-        )
+        return self._read_object(positions, tiling, probes, numbers, first)
 
     def with_walls(self, positions: Floats, reading: Reading, first: Reading) -> Reading:
         """Return the reading of what a pass has left, before another: walls that noise had hidden may show now."""
@@ -214,6 +173,57 @@ class NoiseReader:
     def noise_stds(self, distances: Floats, scales: Floats) -> Floats:
         """Return the noise std of patches shown at some scales, (M,), by what the DistanceModule says of them, (M,)."""
         return self._calibration.noise_std(distances) / scales
+
+    def _read_object(
+        self, positions: Floats, tiling: Tiling, probes: Patches, numbers: range, first: Reading | None
+    ) -> Reading:
+        """Read the noise of an object; numbers: which patches of a whole cut the probes are, none of a tiled one."""
+        scales = patch_scales(probes.radii, scene=False)
+        distances = self._processor.distances(positions, probes, scales)
+        if first is None:
+            reading = self._first_of_object(positions, tiling, probes, distances, scales)
+        else:
+            reading = self._next_of_object(positions, tiling, probes, distances, scales, first)
+        if reading.uneven or reading.parts != (1,):  # patches are shown in other sizes, or are others
+            return reading
+        if reading.zoom != 1.0:
+            scales = patch_scales(probes.radii, scene=False, zoom=reading.zoom)
+            distances = self._processor.distances(positions, probes, scales)
+        return replace(reading, known_distances=dict(zip(numbers, distances.tolist(), strict=False)))
+
+    def _first_of_object(
+        self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats
+    ) -> Reading:
+        """Say how the first pass shows an object; distances: what the DistanceModule says of its probes, (M,)."""
+        noise = self._noise_std(distances, scales)
+        sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
+        in_radii = noise_in_radii(noise, probes.radii)
+        reading = Reading(float(np.median(distances)), noise, False, sampling, noise_in_radii=in_radii, probes=probes)
+        if not self._zoom:
+            return reading
+        noise = self._reread(positions, tiling, noise)
+        zoom, radius = zoom_of(noise, probes.radii), float(np.median(probes.radii))
+        return replace(
+            reading,
+            noise_std=noise,
+            zoom=zoom,
+            parts=parts_of(noise, probes.radii, len(positions)),
+            high_noise=noise > HIGH_NOISE and self._has_high_noise(positions, tiling, noise, radius),
+            uneven=_is_uneven(self.noise_stds(distances, scales), zoom),
+        )
+
+    def _next_of_object(
+        self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, first: Reading
+    ) -> Reading:
+        """Say how a later pass shows an object; distances: as of `_first_of_object`."""
+        noise, zoom, thickness = self._noise_std(distances, scales), 1.0, 0.0
+        if first.noise_in_radii > DENSE_FROM_RADII:
+            thicknesses = self._processor.survey(positions, probes, _thickness_ratios)
+            thickness = float(np.median(np.concatenate(list(thicknesses))))
+        if self._zoom and first.high_noise and noise > _REREAD_FROM * self._largest_noise:
+            zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
+        distance = float(np.median(distances))
+        return Reading(distance, noise, False, first.sampling, zoom, probes=probes, thickness=thickness)
 
     def _reread(self, positions: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""
