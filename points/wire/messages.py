@@ -15,7 +15,6 @@ from straightpcf.points.wire import straightpcf_pb2 as pb
 from straightpcf.points.wire.patches import PatchFrame
 
 __all__ = [
-    "MAX_MESSAGE_BYTES",
     "event_message",
     "event_of",
     "frame_of",
@@ -25,8 +24,7 @@ __all__ = [
     "plain_of",
 ]
 
-MAX_MESSAGE_BYTES = 2**20
-MAX_PATCH_POINTS = 2**14  # 448 KiB; only points that lie in one place make a patch as large as that
+MAX_PATCH_POINTS = 2**14  # of a message, 448 KiB; only points that lie in one place make a patch as large as that
 
 _M = TypeVar("_M", bound=Message)
 

@@ -17,13 +17,13 @@ from straightpcf.service.admission import Limits
 from straightpcf.service.api.disposition import disposition_name
 from straightpcf.service.engine import Engine
 
-__all__ = ["SpoolFile", "Upload", "declared_size", "in_time", "next_part", "receive_upload"]
+__all__ = ["WRITE_BYTES", "SpoolFile", "Upload", "declared_size", "in_time", "next_part", "receive_upload"]
 
 FILE_FIELD = "file"
 MAX_FIELDS = 20
 MAX_FIELD_BYTES = 1024
 MAX_PREAMBLE_BYTES = 2**16
-WRITE_BYTES = 2**20
+WRITE_BYTES = 2**20  # gathered before they are written
 LOOK_SECONDS = 0.25
 
 _CUT_BY_CURL = (b"\n", b"\r", b"\0")  # one of them is in every file of more than one point

@@ -30,7 +30,7 @@ from straightpcf.points.wire.messages import (
 )
 from straightpcf.points.wire.patches import PatchReader
 from straightpcf.service.api.auth import Gate
-from straightpcf.service.api.body import SpoolFile, in_time, next_part
+from straightpcf.service.api.body import WRITE_BYTES, SpoolFile, in_time, next_part
 from straightpcf.service.api.download import open_result
 from straightpcf.service.api.grpc_call import Caller, Context, LateParsing, answering
 from straightpcf.service.api.intake import Coming, file_name
@@ -43,12 +43,11 @@ __all__ = ["GrpcServer"]
 
 SERVICE = pb.DESCRIPTOR.services_by_name["DenoiseService"].full_name
 CHUNK_BYTES = 2**18
-WRITE_BYTES = 2**20
 HEALTH_SECONDS = 0.25
 FORGETTING_SECONDS = 1.0
 _OPTIONS = (
-    # Above LARGEST_MESSAGE, so that this service says itself what is too large: gRPC says it without ErrorInfo. 4 MiB,
-    # and what is around them, is what its servers take otherwise.
+    # Above what `LateParsing` takes, so that this service itself says what is too large: gRPC says it without
+    # ErrorInfo. 4 MiB, and what is around them, is what its servers take otherwise.
     ("grpc.max_receive_message_length", 2**22 + 4096),
     ("grpc.http2.min_recv_ping_interval_without_data_ms", 10_000),
     # gRPC cancels a call that a busy event loop has not taken after 30 s; how long it waits is its caller's to say.

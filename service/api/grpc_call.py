@@ -18,16 +18,15 @@ from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
 from straightpcf.points.errors import InternalError, InvalidRequest, StraightPCFError, TooManyBytes
-from straightpcf.points.wire.messages import MAX_MESSAGE_BYTES
 from straightpcf.service.api.auth import Gate
 from straightpcf.service.api.errors import GRPC_STATUS_BY_CODE, RETRY_AFTER_SECONDS, busy
 from straightpcf.service.api.intake import checked_key
 from straightpcf.service.api.request_id import usable_id
 from straightpcf.service.telemetry import Telemetry
 
-__all__ = ["LARGEST_MESSAGE", "Caller", "Context", "LateParsing", "answering"]
+__all__ = ["Caller", "Context", "LateParsing", "answering"]
 
-LARGEST_MESSAGE = MAX_MESSAGE_BYTES + 4096  # a chunk of 1 MiB, and what is around it
+_LARGEST_MESSAGE = 2**20 + 4096  # a chunk of 1 MiB, and what is around it
 DOMAIN = "straightpcf"
 _MESSAGE_BYTES = 1500  # it is sent twice, once percent-encoded, in metadata of which clients take 8 KiB
 _CANCELLED_WITHIN_SECONDS = 1.0
@@ -75,9 +74,9 @@ class _Unparsable:
 
 
 def _parsed(parse: Callable[[bytes], Any], data: bytes) -> Any:
-    if len(data) > LARGEST_MESSAGE:
-        said = f"a message of the call has {len(data)} bytes; the limit is {LARGEST_MESSAGE}: send a file in more"
-        raise TooManyBytes(said)
+    if len(data) > _LARGEST_MESSAGE:
+        size = f"a message of the call has {len(data)} bytes; the limit is {_LARGEST_MESSAGE}"
+        raise TooManyBytes(f"{size}: send a file in smaller chunks")
     return parse(data)
 
 
