@@ -143,33 +143,20 @@ def upload_call(
     name = _sendable(name or own_name)
     if name is None and isinstance(body, bytes):
         recognised(body[:HEAD_BYTES], None)
-    if target is not None and format is None:
-        format = format_wanted(target.name, name)
-    elif target is not None and format is not None:
-        check_suffix(target, format)
+    format = _format_of(target, format, name)
     params = {name: str(value) for name, value in asdict(options).items()}
     if name is not None:
         params["filename"] = name
     if format is not None:
-        params["format"] = format_named(format).name
-    if key is not None and not (key.isascii() and key.isprintable()):
-        raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
-    if key is not None and key != key.strip():
-        raise InvalidRequest(f"the idempotency key begins or ends with a space: {key[:40]!r}")
-    if isinstance(body, Path):
-        status = body.stat()
-        size, written = status.st_size, status.st_mtime_ns
-    else:
-        size, written = len(body), 0
-    headers = {
-        "Content-Type": "application/octet-stream",
-        "Content-Length": str(size),
-        **({} if key is None else {"Idempotency-Key": key}),
-    }
+        params["format"] = format
+    size, written = _size_and_time(body)
+    headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+    if key is not None:
+        headers["Idempotency-Key"] = _sendable_key(key)
     id = id or uuid.uuid4().hex
     if not JOB_ID.fullmatch(id):
         raise InvalidRequest(f"job id is {id[:80]!r}; it must be {JOB_ID_RULE}")
-    fields = {"options": asdict(options), "filename": name, "format": params.get("format"), "id": id, "bytes": size}
+    fields = {"options": asdict(options), "filename": name, "format": format, "id": id, "bytes": size}
     # PUT: whoever chose the id can cancel the job even if the answer never arrived.
     return Call(
         method="PUT", path=_job(id), rpc="CreateJob", fields=fields, params=params, headers=headers, body=body,
@@ -263,6 +250,15 @@ def check_suffix(target: Path, format: str) -> None:
         )
 
 
+def _format_of(target: Path | None, format: str | None, name: str | None) -> str | None:
+    """Return the name of the result's format; None for that of the source, which is called `name`."""
+    if target is not None and format is None:
+        format = format_wanted(target.name, name)
+    elif target is not None and format is not None:
+        check_suffix(target, format)
+    return None if format is None else format_named(format).name
+
+
 def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     if isinstance(source, str | os.PathLike):
         path = Path(source)
@@ -277,6 +273,23 @@ def _name_and_body(source: Source) -> tuple[str | None, bytes | Path]:
     buffer = io.BytesIO()
     np.save(buffer, as_positions(getattr(source, "points", source)), allow_pickle=False)
     return "cloud.npy", buffer.getvalue()
+
+
+def _size_and_time(body: bytes | Path) -> tuple[int, int]:
+    """Return how many bytes a body has, and when, if it is a file, it was written last (ns)."""
+    if isinstance(body, bytes):
+        return len(body), 0
+    status = body.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _sendable_key(key: str) -> str:
+    """Return an idempotency key; raises InvalidRequest where no header carries it as it is."""
+    if not (key.isascii() and key.isprintable()):
+        raise InvalidRequest(f"the idempotency key holds more than printable ASCII: {key[:40]!r}")
+    if key != key.strip():
+        raise InvalidRequest(f"the idempotency key begins or ends with a space: {key[:40]!r}")
+    return key
 
 
 def _sendable(name: str | Path | None) -> str | None:
