@@ -6,7 +6,7 @@ import hashlib
 import os
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import nullcontext
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from straightpcf.points.wire.patches import encode_end, encode_frame, encode_hea
 from straightpcf.service.backends.base import FileJob, FileReport
 
 if TYPE_CHECKING:
-    from straightpcf.model.filter import Filter
+    from straightpcf.model.filter import DenoiseResult, Filter
 
 __all__ = ["denoise_file"]
 
@@ -45,7 +45,6 @@ def denoise_file(
     heed: called more often than that, and may raise as well (`Filter.heeding`).
     The target is on the disk, not only in its cache, when this returns.
     """
-    from straightpcf.model.filter import Run
     from straightpcf.model.normals import recompute_normals
 
     began = time.monotonic()
@@ -57,27 +56,8 @@ def denoise_file(
     if on_progress is not None:
         on_progress(0.0, 0)
     was_read = time.monotonic()
-    run = Run(denoiser, cloud.xyz, job.options)
-    with ExitStack() as opened:
-        if heed is not None:
-            opened.enter_context(denoiser.heeding(heed))
-        patches = None if job.patches is None else opened.enter_context(_PatchFile(job.patches))
-        if patches is not None:
-            patches.write(encode_header(len(cloud)))
-        preview = _Preview(len(cloud), on_preview)
-        for patch in run.patches():
-            if patches is not None and len(patch.indices):
-                patches.write(
-                    encode_frame(patch.indices, patch.xyz, iteration=patch.iteration, final=patch.final,
-                                 progress=patch.progress)
-                )  # fmt: skip
-            preview.add(patch.iteration, patch.indices, patch.xyz)
-            if on_progress is not None:
-                on_progress(patch.progress, patch.iteration)
-        preview.end()
-        result = run.result(time.monotonic() - was_read)
-        if patches is not None:
-            patches.write(encode_end(result.iterations))
+    with denoiser.heeding(heed) if heed is not None else nullcontext():
+        result = _filtered(denoiser, cloud, job, on_progress, on_preview)
     was_filtered = time.monotonic()
     clean = cloud.with_xyz(result.xyz)
     if job.options.normals == "recompute":
@@ -101,6 +81,33 @@ def denoise_file(
         sha256=sha256,
         warnings=(*result.warnings, *_left_behind(clean, source_format, target_format)),
     )
+
+
+def _filtered(
+    denoiser: Filter, cloud: PointCloud, job: FileJob, on_progress: OnProgress | None, on_preview: OnPreview | None
+) -> DenoiseResult:
+    """Filter a cloud, and tell of each patch as it is finished; the patches are in their file when this returns."""
+    from straightpcf.model.filter import Run
+
+    began = time.monotonic()
+    run, preview = Run(denoiser, cloud.xyz, job.options), _Preview(len(cloud), on_preview)
+    with _PatchFile(job.patches) if job.patches is not None else nullcontext() as patches:
+        if patches is not None:
+            patches.write(encode_header(len(cloud)))
+        for patch in run.patches():
+            if patches is not None and len(patch.indices):
+                patches.write(
+                    encode_frame(patch.indices, patch.xyz, iteration=patch.iteration, final=patch.final,
+                                 progress=patch.progress)
+                )  # fmt: skip
+            preview.add(patch.iteration, patch.indices, patch.xyz)
+            if on_progress is not None:
+                on_progress(patch.progress, patch.iteration)
+        preview.end()
+        result = run.result(time.monotonic() - began)
+        if patches is not None:
+            patches.write(encode_end(result.iterations))
+    return result
 
 
 class _PatchFile:
