@@ -58,75 +58,78 @@ def connection_class(settings: Settings) -> type[H11Protocol]:
     uvicorn's own begins with an answer and ends with the next byte, be it of half a request or of a body that was
     refused. A peer that then vanishes (a laptop that is closed, a NAT that forgets) would keep its descriptor.
     """
+    return type("Connection", (_Connection,), {"_settings": settings})
 
-    class Connection(H11Protocol):
-        _lingers = False
 
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; RFC 5482, of a closed window, too
-                longest = min(round(settings.download_idle_seconds * 1000) or 1, _LONGEST_USER_TIMEOUT)
-                own: socket.socket = transport.get_extra_info("socket")
-                own.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, longest)
-            self._be_patient()
+class _Connection(H11Protocol):
+    _settings: Settings  # of its server
+    _lingers = False
 
-        def data_received(self, data: bytes) -> None:
-            if self._lingers:
-                self._unset_keepalive_if_required()
-            else:
-                super().data_received(data)
-            self._be_patient()
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; RFC 5482, of a closed window, too
+            longest = min(round(self._settings.download_idle_seconds * 1000) or 1, _LONGEST_USER_TIMEOUT)
+            own: socket.socket = transport.get_extra_info("socket")
+            own.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, longest)
+        self._be_patient()
 
-        def handle_events(self) -> None:
-            """Answer a request with two lengths as one that asks to close: a proxy may have heeded the other.
+    def data_received(self, data: bytes) -> None:
+        if self._lingers:
+            self._unset_keepalive_if_required()
+        else:
+            super().data_received(data)
+        self._be_patient()
 
-            What that took for the rest of the body would else be a request of its own (RFC 9112, 6.1).
-            """
-            before = self.cycle
-            super().handle_events()
-            if self.cycle is before:
-                return
-            if _TWO_LENGTHS.issubset(name for name, _ in self.headers):
-                self.headers.append(_CLOSE)
-            self.cycle.default_headers = _AsItBegins(self.server_state, self.conn)  # type: ignore[assignment]
-            self.cycle.transport = _Answering(self.transport, close=self._close_behind)  # type: ignore[assignment]
+    def handle_events(self) -> None:
+        """Answer a request with two lengths as one that asks to close: a proxy may have heeded the other.
 
-        def _close_behind(self) -> None:
-            """Close behind an answer; where the body still comes, our half only, and let it come (RFC 9112, 9.6).
+        What that took for the rest of the body would else be a request of its own (RFC 9112, 6.1).
+        """
+        before = self.cycle
+        super().handle_events()
+        if self.cycle is before:
+            return
+        if _TWO_LENGTHS.issubset(name for name, _ in self.headers):
+            self.headers.append(_CLOSE)
+        self.cycle.default_headers = _AsItBegins(self.server_state, self.conn)  # type: ignore[assignment]
+        self.cycle.transport = _Answering(self.transport, close=self._close_behind)  # type: ignore[assignment]
 
-            A closed socket answers what comes with a reset, which takes the answer away from who has not read it yet.
-            """
-            if self.conn.their_state is h11.SEND_BODY and self.cycle.response_complete:
-                self._lingers = True
-                self.transport.write_eof()
-            else:
-                self.transport.close()
+    def _close_behind(self) -> None:
+        """Close behind an answer; where the body still comes, our half only, and let it come (RFC 9112, 9.6).
 
-        def send_400_response(self, msg: str) -> None:
-            """Answer what is no HTTP, where no answer has begun, and close."""
-            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-                if self.cycle is not None:
-                    self.cycle.disconnected = True  # of a body that broke off: the app's answer would be one more
-                asked = Request({"type": "http", "request_id": usable_id(None)})
-                problem = problem_response(asked, InvalidRequest(f"this is no HTTP/1.1: {sys.exc_info()[1]}"), 400)
-                headers = [*self.server_state.default_headers, *problem.raw_headers, _CLOSE]  # Date is one of them
-                head = h11.Response(status_code=400, headers=headers)
-                for event in (head, h11.Data(data=bytes(problem.body)), h11.EndOfMessage()):
-                    self.transport.write(self.conn.send(event) or b"")
+        A closed socket answers what comes with a reset, which takes the answer away from who has not read it yet.
+        """
+        if self.conn.their_state is h11.SEND_BODY and self.cycle.response_complete:
+            self._lingers = True
+            self.transport.write_eof()
+        else:
             self.transport.close()
 
-        def _unsupported_upgrade_warning(self) -> None:
-            """Warn of nothing: what would rather have HTTP/2 is answered all the same (RFC 9110, 7.8).
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP, where no answer has begun, and close."""
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            if self.cycle is not None:
+                self.cycle.disconnected = True  # of a body that broke off: the app's answer would be one more
+            asked = Request({"type": "http", "request_id": usable_id(None)})
+            problem = problem_response(asked, InvalidRequest(f"this is no HTTP/1.1: {sys.exc_info()[1]}"), 400)
+            headers = [*self.server_state.default_headers, *problem.raw_headers, _CLOSE]  # Date is one of them
+            head = h11.Response(status_code=400, headers=headers)
+            for event in (head, h11.Data(data=bytes(problem.body)), h11.EndOfMessage()):
+                self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
 
-            Java's client asks for it with every request, and the warning says to install WebSockets.
-            """
+    def _unsupported_upgrade_warning(self) -> None:
+        """Warn of nothing: what would rather have HTTP/2 is answered all the same (RFC 9110, 7.8).
 
-        def _be_patient(self) -> None:
-            is_answering = self.cycle is not None and not self.cycle.response_complete
-            if self.timeout_keep_alive_task is None and not is_answering:
-                self.timeout_keep_alive_task = self.loop.call_later(settings.upload_idle_seconds, self.transport.close)
+        Java's client asks for it with every request, and the warning says to install WebSockets.
+        """
 
-    return Connection
+    def _be_patient(self) -> None:
+        is_answering = self.cycle is not None and not self.cycle.response_complete
+        if self.timeout_keep_alive_task is None and not is_answering:
+            self.timeout_keep_alive_task = self.loop.call_later(
+                self._settings.upload_idle_seconds, self.transport.close
+            )
 
 
 class _AsItBegins:
