@@ -65,25 +65,10 @@ logger = logging.getLogger("uvicorn.error")
 def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI:
     """Wire one server together; nothing starts before the app's lifespan does."""
     engine = Engine(backend or _local_backend(settings), limits=_limits(settings), data_dir=settings.data_dir)
-
     telemetry = Telemetry(engine)
     gate = Gate(settings.keys(), rate_per_minute=settings.rate_per_minute)
     coming = Coming(engine)
     grpc = _grpc_server(settings, engine, coming, gate, telemetry)
-
-    @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        tell_briefly(asyncio.get_running_loop())
-        await engine.start()
-        try:
-            if grpc is not None:
-                await grpc.start()
-            yield
-        finally:
-            if grpc is not None:
-                engine.drain()
-                await grpc.stop(patience_seconds=engine.patience_seconds)
-            await engine.stop()
 
     app = FastAPIOffline(  # /docs has its scripts here: many servers have no way out
         redoc_url=None,  # would ask its maker's server for a picture
@@ -91,7 +76,7 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         title="StraightPCF",
         version=straightpcf.__version__,
         summary="Hand it a noisy point cloud, get the same points back on the surface.",
-        lifespan=lifespan,
+        lifespan=lambda _: _running(engine, grpc),
     )
     for route in app.routes:  # of the document and of /docs
         if isinstance(route, Route) and route.methods:
@@ -117,6 +102,21 @@ def create_app(settings: Settings, *, backend: Backend | None = None) -> FastAPI
         "/metrics", telemetry.endpoint, include_in_schema=False, dependencies=[Depends(owner_of)], methods=["GET"]
     )
     return app
+
+
+@asynccontextmanager
+async def _running(engine: Engine, grpc: GrpcServer | None) -> AsyncIterator[None]:
+    tell_briefly(asyncio.get_running_loop())
+    await engine.start()
+    try:
+        if grpc is not None:
+            await grpc.start()
+        yield
+    finally:
+        if grpc is not None:
+            engine.drain()
+            await grpc.stop(patience_seconds=engine.patience_seconds)
+        await engine.stop()
 
 
 def serve(settings: Settings) -> None:
