@@ -162,7 +162,7 @@ def recognised(head: bytes, called: str | None) -> Format:
     if not head:
         raise MalformedFile(f"{name[:80]} is empty (0 bytes)")
     for format in FORMATS:
-        if format.has_magic and format.sniff(head):
+        if format.sniff(head):
             return format
     for magic, packer in _PACKED.items():
         if head.startswith(magic):

@@ -33,9 +33,9 @@ class Format(ABC):
     has_magic: ClassVar[bool] = True  # False: only the file's suffix says what it is
     types: ClassVar[Collection[str]] = ()  # of the numbers that a new file has columns for, such as "f4"
 
-    @abstractmethod
     def sniff(self, head: bytes) -> bool:
-        """Tell whether a file that begins with `head` (up to 4 KiB) is of this format; False if it has no magic."""
+        """Tell whether a file that begins with `head` (up to 4 KiB) is of this format; one without magic never says."""
+        return False
 
     def estimate(self, head: bytes, size: int) -> int:
         """Guess the points of a file of `size` bytes that begins with `head`: for admission, before it is read."""

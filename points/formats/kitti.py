@@ -32,16 +32,12 @@ class KittiSource:
 
 
 class Kitti(Format):
-    """Read and write .bin frames; nothing in the bytes says what they are, so the name decides."""
+    """Read and write .bin frames; any 16 bytes are a row, so the name decides."""
 
     name = "kitti"
     suffixes = (".bin",)
     media_type = "application/octet-stream"
     has_magic = False
-
-    def sniff(self, head: bytes) -> bool:
-        """Recognise nothing: any 16 bytes are a row."""
-        return False
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read rows of four float32; the fourth is the attribute `intensity`.

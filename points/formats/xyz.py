@@ -78,10 +78,6 @@ class Xyz(Format):
     types = _TYPES
     is_counted: ClassVar[bool] = False  # a new file begins with the number of points
 
-    def sniff(self, head: bytes) -> bool:
-        """Recognise nothing: text has no magic, its suffix says what it is."""
-        return False
-
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read the table; further columns of numbers become float64 attributes, int64 or uint64 where they need to."""
         raw = path.read_bytes()
