@@ -13,7 +13,7 @@ _CHUNK = 50_000
 
 
 def recompute_normals(
-    xyz: npt.NDArray[np.float64], old: npt.NDArray[np.float64], *, neighbours: int = NEIGHBOURS, workers: int = 1
+    xyz: npt.NDArray[np.float64], old: npt.NDArray[np.float64], *, workers: int = 1
 ) -> npt.NDArray[np.float64]:
     """Return unit normals (N, 3) float64 of points (N, 3): the direction in which their neighbours spread least.
 
@@ -28,7 +28,7 @@ def recompute_normals(
     tree = cKDTree(here)
     for start in range(0, len(rows), _CHUNK):
         some = slice(start, start + _CHUNK)
-        _, index = tree.query(here[some], k=min(neighbours, len(rows)), workers=workers)
+        _, index = tree.query(here[some], k=min(NEIGHBOURS, len(rows)), workers=workers)
         spread = here[index] - here[index].mean(axis=1, keepdims=True)  # (n, k, 3)
         largest = np.abs(spread).max(axis=(1, 2), keepdims=True)
         spread /= np.where(largest > 0, largest, 1.0)

@@ -91,7 +91,7 @@ class JobInfo:
         return JobExpired(f"the files of job {self.id} were removed") if self.state == "expired" else None
 
     @classmethod
-    def parse(cls, body: Mapping[str, Any], *, request_id: str | None = None) -> JobInfo:
+    def parse(cls, body: Mapping[str, Any]) -> JobInfo:
         """Read the JSON form; what a newer server adds is left out."""
         values = _known(cls, body)
         for name in ("created_at", "started_at", "finished_at", "expires_at"):
@@ -101,7 +101,7 @@ class JobInfo:
             **values
             | {
                 "options": DenoiseOptions(**_known(DenoiseOptions, options)),
-                "error": None if error is None else _error(error, request_id),
+                "error": None if error is None else _error(error),
                 "result": None if result is None else ResultInfo(**_known(ResultInfo, result)),
                 "report": None if report is None else Report.parse(report),
             },
@@ -113,6 +113,5 @@ def _known(kind: type[Any], body: Mapping[str, Any]) -> dict[str, Any]:
     return {item.name: body[item.name] for item in dataclasses.fields(kind) if item.name in body}
 
 
-def _error(body: Mapping[str, Any], request_id: str | None) -> StraightPCFError:
-    kind = ERRORS_BY_CODE.get(body["code"], InternalError)
-    return kind(body["detail"], request_id=request_id)
+def _error(body: Mapping[str, Any]) -> StraightPCFError:
+    return ERRORS_BY_CODE.get(body["code"], InternalError)(body["detail"])
