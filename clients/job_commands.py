@@ -27,7 +27,7 @@ from straightpcf.points.errors import InvalidOptions
 if TYPE_CHECKING:
     from straightpcf.clients.sdk import Client, JobInfo
 
-__all__ = ["Format", "Iterations", "Key", "Name", "Seed", "Strength", "Url", "connect", "install"]
+__all__ = ["Format", "Iterations", "Key", "Name", "Normals", "Seed", "Strength", "connect", "install"]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 

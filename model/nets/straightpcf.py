@@ -10,7 +10,6 @@ from straightpcf.model.nets.edgeconv import NEIGHBOURS, Decoder, Encoder
 
 __all__ = ["DistanceModule", "StraightPCF", "VelocityModule"]
 
-
 # What patches agree on in the first evaluation differs from what one of them says mostly as its later ones would.
 _AGREED_SHARE = 0.5
 _PATCHES_PER_RADIUS = 4.0  # the median patch of training has a quarter of its object's radius

@@ -29,7 +29,7 @@ from straightpcf.points.formats.text import (
 from straightpcf.points.formats.titles import MARKS, MAX_COLUMNS
 from straightpcf.points.formats.xyz_layout import PTS_COLUMNS, Layout, read_layout
 
-__all__ = ["MAX_COLUMNS", "Csv", "Pts", "Tsv", "Xyz"]
+__all__ = ["Csv", "Pts", "Tsv", "Xyz"]
 
 MAX_LINE_BYTES = 1 << 23
 _COUNTED = 10  # points: of fewer, an x may go up by one each

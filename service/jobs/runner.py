@@ -20,7 +20,7 @@ from straightpcf.service.jobs.result_name import result_name
 from straightpcf.service.jobs.store import JobStore
 from straightpcf.service.jobs.troubles import Troubles
 
-__all__ = ["JobRunner"]
+__all__ = ["JobRunner", "StoreCall"]
 
 MAX_DEATHS = 3
 LEASE_SECONDS = 15.0
@@ -39,7 +39,8 @@ logger = logging.getLogger("uvicorn.error")  # the log that `straightpcf serve` 
 class StoreCall(Protocol):
     """Run one method of the store on its thread."""
 
-    def __call__(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Awaitable[Any]: ...
+    def __call__(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Awaitable[Any]:
+        """Return what it returns."""
 
 
 class JobRunner:
