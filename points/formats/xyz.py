@@ -189,7 +189,7 @@ def _table(
     """
     starts, ends = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
     parts: dict[int, list[npt.NDArray[Any]]] = {column: [np.empty(0)] for column in range(len(layout.names))}
-    line, count, may_miss, declared = layout.line, 0, layout.delimiter is not None, layout.declared
+    line, count, declared = layout.line, 0, layout.declared
     texts, unsaid = [], {column for column, name in enumerate(layout.names) if name == f"column_{column + 1}"}
     for lines, _ in blocks(raw, layout.begin, delimiter=layout.delimiter, longest=MAX_LINE_BYTES):
         is_row = _is_row(lines)
@@ -204,17 +204,10 @@ def _table(
         _check_columns(table, numbers, len(layout.names))
         for column in list(parts):
             token = table.first + column
-            begins, stops = table.starts[token], table.ends[token]
-            if column in unsaid and (begins < stops).any():
+            if column in unsaid and (table.starts[token] < table.ends[token]).any():
                 unsaid.remove(column)
-            values, bad = as_numbers(raw, begins, stops, may_miss=may_miss)
-            if bad is None:
-                has_ids = column not in layout.axes and _is_beyond_doubles(values)
-                parts[column].append(_whole(table, token, values) if has_ids else values)
-            elif column in layout.axes:
-                text = raw[begins[bad] : stops[bad]]
-                hint = "; decimals have a point here, no comma" if _has_decimal_comma(text, layout.delimiter) else ""
-                raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number{hint}")
+            if (values := _column(table, column, layout, numbers)) is not None:
+                parts[column].append(values)
             else:
                 texts.append(column)  # it stays in the file
                 del parts[column]
@@ -226,6 +219,21 @@ def _table(
     there = {*layout.axes} | ({*parts} - unsaid)
     columns = {column: _joined(values) for column, values in parts.items() if column in there}
     return np.concatenate(starts), np.concatenate(ends), columns, sorted(texts)
+
+
+def _column(table: Lines, column: int, layout: Layout, numbers: _Offsets) -> npt.NDArray[Any] | None:
+    """Read a column of rows with these line numbers, (K,); None where it is text. Raises MalformedFile of an axis."""
+    token = table.first + column
+    begins, stops = table.starts[token], table.ends[token]
+    values, bad = as_numbers(table.raw, begins, stops, may_miss=layout.delimiter is not None)
+    if bad is None:
+        has_ids = column not in layout.axes and _is_beyond_doubles(values)
+        return _whole(table, token, values) if has_ids else values
+    if column not in layout.axes:
+        return None
+    text = table.raw[begins[bad] : stops[bad]]
+    hint = "; decimals have a point here, no comma" if _has_decimal_comma(text, layout.delimiter) else ""
+    raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number{hint}")
 
 
 def _meant(columns: Mapping[int, npt.NDArray[Any]]) -> tuple[str, ...]:
