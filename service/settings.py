@@ -183,9 +183,11 @@ class Settings:
             name = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
             if name not in kinds:
                 raise InvalidOptions(f"{variable} is no setting; known: {', '.join(sorted(kinds))}")
-            # Compose files leave a setting blank to say nothing; keys that are wanted and missing are a fault.
-            if text.strip() or name == "api_keys_file":
+            if text.strip():
                 values[name] = _parse(variable, kinds[name], text)
+            # Compose files leave a setting blank to say nothing; keys that are wanted and missing are a fault.
+            elif name == "api_keys_file":
+                raise InvalidOptions(f"{variable} is blank; name a file, or leave it out for a server without keys")
         values |= {name: value for name, value in overrides.items() if value is not None}
         return cls(**values)
 
