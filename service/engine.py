@@ -258,8 +258,8 @@ class Engine:
         until = None if seconds is None else loop.time() + seconds
         while True:
             news = self._news_of(id)
-            record = await self.get(id, owner=owner)
             left = POLL_SECONDS if until is None else min(POLL_SECONDS, until - loop.time())
+            record = await (self._call(JobStore.look, id, owner) if left > 0 else self.get(id, owner=owner))
             if record.finished or left <= 0:
                 return record
             await self._further(news, left)
@@ -356,8 +356,8 @@ class Engine:
     # --- inside
 
     async def _same(self, id: str, owner: str, folder: str | None) -> JobRecord:
-        """Return a job as it is; raises NotFound where it is not the one of that folder any more, if one is given."""
-        record = await self.get(id, owner=owner)
+        """Look at a job; raises NotFound where it is not the one of that folder any more, if one is given."""
+        record = await self._call(JobStore.look, id, owner)
         if folder is not None and record.folder != folder:
             raise NotFound(f"job {id} was deleted, and its id is another's now")
         return record

@@ -92,12 +92,11 @@ class JobStore:
                     return record, False
                 self._db.execute("DELETE FROM jobs WHERE seq = ?", (known["seq"],))
                 job = replace(job, id=record.id)
-            now = time.time()
             self._db.execute(
                 "INSERT INTO jobs (id, owner, folder, state, name, format, options, bytes, weight, spool, created_at,"
                 " traceparent, idempotency_key, digest) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 (job.id, job.owner, job.folder, job.name, job.format, json.dumps(asdict(job.options)), job.bytes,
-                 job.weight, job.spool, now, job.traceparent, job.idempotency_key, job.digest),
+                 job.weight, job.spool, time.time(), job.traceparent, job.idempotency_key, job.digest),
             )  # fmt: skip
             record = self._record(self._row(job.id))
             self._add_event(job.id, "queued", {"position": record.position})
@@ -116,6 +115,10 @@ class JobStore:
     def get(self, id: str, owner: str | None = None) -> JobRecord:
         """Return a job; raises NotFound, also for a job of another owner."""
         return self._record(self._row(id, owner))
+
+    def look(self, id: str, owner: str) -> JobRecord:
+        """Do as `get`, but for the position, which takes a count of all that waits: for who looks again and again."""
+        return record_of(self._row(id, owner))
 
     def page(
         self, *, owner: str, states: Collection[JobState] = (), limit: int = 50, cursor: str | None = None

@@ -22,8 +22,10 @@ from straightpcf.points.errors import (
     UnknownFormat,
 )
 from straightpcf.points.options import DenoiseOptions
+from straightpcf.service import engine as engine_module
 from straightpcf.service.engine import CHUNK_BYTES, Engine
 from straightpcf.service.jobs.record import JobRecord
+from straightpcf.service.jobs.store import JobStore
 from tests.service.engines import kinds, play, submit
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -61,6 +63,38 @@ def test_who_follows_a_job_is_not_led_into_another_that_takes_its_id(tmp_path: P
             b"".join([chunk async for chunk in patches])
         kept = [event.kind async for event in events]  # read at once, before the job was deleted
         assert kept == ["start", "progress", "log", "output", "completed"]
+
+    play(tmp_path, scenario)
+
+
+def test_who_follows_a_job_does_not_have_the_whole_queue_counted_at_each_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_module, "POLL_SECONDS", 0.02)
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 1
+        return 0
+
+    def crowd(store: JobStore) -> None:
+        store._db.execute(
+            "WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 3000) INSERT INTO jobs"
+            " (id, owner, folder, state, options, bytes, weight, created_at, digest)"
+            " SELECT i, '', i, 'queued', '{}', 1, 1, 0, i FROM n"
+        )
+        store._db.set_progress_handler(count, 1)  # of SQLite's machine, of which a row takes several
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        record, _ = await submit(engine)
+        await engine._call(crowd)
+        looks = [engine.wait(record.id), kinds(engine, record.id), anext(aiter(engine.patches(record.id)))]
+        await asyncio.wait(followers := [asyncio.ensure_future(look) for look in looks], timeout=0.3)
+        assert 50 < steps < 3000
+        for follower in followers:
+            follower.cancel()
+        assert (await engine.wait(record.id, seconds=0)).position == 0
 
     play(tmp_path, scenario)
 

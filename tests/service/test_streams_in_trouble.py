@@ -56,13 +56,13 @@ def test_a_request_that_is_sent_away_leaves_no_job_behind(tmp_path: Path) -> Non
         ):
             asked = asyncio.create_task(http.post("/denoise?filename=a.xyz", content=CLOUD))
             await until(lambda: backend.runs)
-            get = engine.get
+            call = engine._call
 
-            async def fails_once(id: str, *, owner: str = "") -> None:
-                engine.get = get  # type: ignore[method-assign]
+            async def fails_once(*_: object) -> None:
+                engine._call = call
                 raise OSError(5, "Input/output error")
 
-            engine.get = fails_once  # type: ignore[assignment, method-assign]
+            engine._call = fails_once  # type: ignore[assignment]
             engine._notify(backend.runs[0].id)
             answer = await asked
             assert (answer.status_code, answer.json()["detail"]) == (503, SAID)
