@@ -21,7 +21,7 @@ from straightpcf.clients.console import (
     asked_to_stop,
     complain,
     ended_in_a_line,
-    forgiving_stderr,
+    forgive,
     interruptible,
     needs,
     print_json,
@@ -88,7 +88,7 @@ def main() -> None:
     """Run the command line."""
     if sys.stdout is not None:  # a name that its encoding does not have is no error
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-    forgiving_stderr()
+    forgive("stderr")
     with quiet_end():
         app(prog_name="straightpcf")
 
@@ -236,6 +236,7 @@ def serve(
         max_points=max_points,
         max_jobs=max_jobs,
     )
+    forgive("stdout")  # it has the log of requests alone
     run_server(settings)
 
 

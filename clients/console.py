@@ -30,7 +30,7 @@ __all__ = [
     "ended_in_a_line",
     "exit_code",
     "for_each",
-    "forgiving_stderr",
+    "forgive",
     "interruptible",
     "needs",
     "print_json",
@@ -134,8 +134,11 @@ def _forget_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def forgiving_stderr() -> None:
-    """Let what stderr does not take be lost: a full disk or a terminal that is gone changes nothing of what is done."""
+def forgive(name: str) -> None:
+    """Let what stdout or stderr does not take be lost: a full disk under a log, a terminal or reader that is gone.
+
+    It then changes nothing of what is done. name: as in `sys`.
+    """
     import io
 
     class Forgiving(io.FileIO):
@@ -145,12 +148,11 @@ def forgiving_stderr() -> None:
                 written = super().write(data)  # None: it does not block, and is full
             return len(memoryview(data).cast("B")) if written is None else written
 
-    if sys.stderr is None:
+    if (stream := getattr(sys, name)) is None:
         return
-    sys.stderr.flush()
-    raw = Forgiving(sys.stderr.fileno(), "w", closefd=False)
-    encoding = sys.stderr.encoding
-    sys.stderr = io.TextIOWrapper(io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=True)
+    stream.flush()
+    buffer = io.BufferedWriter(Forgiving(stream.fileno(), "w", closefd=False))
+    setattr(sys, name, io.TextIOWrapper(buffer, stream.encoding, "backslashreplace", line_buffering=True))
 
 
 @contextmanager

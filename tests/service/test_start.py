@@ -87,6 +87,14 @@ def test_a_server_whose_stdout_is_closed_starts(tmp_path: Path) -> None:
         assert server._status("/livez") == 200
 
 
+def test_a_server_whose_stdout_takes_nothing_goes_on_and_fills_no_other_log(tmp_path: Path) -> None:
+    """As where it is a pipe to a program that has ended: the log of errors had a traceback of each request."""
+    with run_server(tmp_path, within=("/bin/sh", "-c", 'exec "$@" >/dev/full', "sh")) as server:
+        assert server._status("/livez") == 200
+    assert server.process.returncode == 0
+    assert "Traceback" not in server.log.read_text()
+
+
 def test_a_server_starts_whatever_web_concurrency_says(tmp_path: Path) -> None:
     """Platforms set it for servers that fork; uvicorn reads it as a number, even where it is not to fork."""
     with run_server(tmp_path, environment={"WEB_CONCURRENCY": "auto"}) as server:
