@@ -189,6 +189,7 @@ CONDITIONS: dict[str, Make] = {
     "thinning": _fewer(lambda rng, clean: rng.random(len(clean)) < (0.05 + 0.95 * _along(clean)[:, 0]) ** 2, 0.01),
     "cut": _fewer(lambda _, clean: _along(clean)[:, 0] > 0.5, 0.02),
     "thousand": _fewer(lambda rng, clean: rng.permutation(len(clean)) < 1000, 0.02),
+    "two-thousand": _fewer(lambda rng, clean: rng.permutation(len(clean)) < 2000, 0.01),
     "little": _gaussian(lambda _: np.array([0.0025])),
     "four": _gaussian(lambda _: np.array([0.04])),
 }

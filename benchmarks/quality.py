@@ -173,7 +173,8 @@ def _runner(name: str, options: argparse.Namespace) -> Run:
 
     def run_every(cloud: Floats, _: float) -> Filtered:
         states, readings = every_pass(model, cloud, seed=options.seed)
-        chosen = passes(model.calibration, Trace.of(readings, (), cloud="", noise_std=0.0, noise_type=""))
+        known = Trace.of(readings, (), cloud="", noise_std=0.0, noise_type="", points=len(cloud))
+        chosen = passes(model.calibration, known)
         return Filtered(states[chosen], chosen, tuple(states[1:]))
 
     return run_every if options.every_pass else run

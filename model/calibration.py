@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile
 
-__all__ = ["DENSE_FROM_RADII", "Calibration"]
+__all__ = ["DENSE_FROM_RADII", "FEWEST_POINTS", "FEW_POINTS", "Calibration"]
 
 # d of noise that one pass takes most of: hardly any, little, and what leaves more of thin bodies (1.5 to 2 %).
 _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
@@ -24,6 +24,14 @@ _STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, DENSE_FROM_RADII = 0.7, 8.0, 0.03
 _LEFT_THICKNESS, _THINNED, _THICK = 0.03, 0.75, 0.3
 # d says little of walls that a pass has begun to part: each of the next ones parts them farther.
 _PASSES_OF_SHOWN_WALLS = 4
+# Of few points bends look like noise, and passes pull them flat; the fewest get one. So do others where a patch's noise
+# in its radii, times the points, is less than the first, or less than the second where they lie by chance; or where the
+# first leaves more than this share of d, and this d. Else they get two, up to the second. Shape is also what leaves
+# nearly all of d, up to a larger one at the start than of many points.
+FEWEST_POINTS, FEW_POINTS = 500, 5000
+_NOISE_OF_FEW, _LARGE_NOISE_OF_FEW = 14.0, 0.04
+_LEFT_OF_FEW, _SETTLED_OF_FEW = 0.5, 0.17
+_STUCK_OF_FEW, _LOUD_DISTANCE = 0.75, 0.93
 _FORMER = "crowded"  # a limit that older weights have: the thickness of the surface took its place
 
 
@@ -95,13 +103,16 @@ class Calibration:
         distances: Sequence[float],
         noise_in_radii: float = 0.0,
         *,
+        points: int = FEW_POINTS,
+        irregular: bool = False,
         thin_walls: bool = False,
         shown_walls: bool = False,
         thicknesses: Sequence[float] = (),
     ) -> int:
         """Say how many passes to go: 0, 1, or 2 for "one or more".
 
-        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, of a patch;
+        distances: d before each pass that was made, and now; noise_in_radii: the noise at the start, of a patch, 0 of a
+        scene; points: how many there are; irregular: whether they lie on their surface by chance, or in lines;
         thin_walls: whether points seemed to be on walls close together before the first pass; shown_walls: whether they
         seem to be since, where strong noise hid them; thicknesses: of the surface (`Reading`), as many as distances.
         """
@@ -118,9 +129,23 @@ class Calibration:
         dense = polished == 2 and noise_in_radii > DENSE_FROM_RADII and not thin_walls
         polishing = due <= done < polished and now < self.settled[done - 1]
         left = dense and _has_left(thicknesses)
-        if done >= self.most or not (done < due or polishing or left or now > self.stirred):
+        most = self._most_of_few(distances, noise_in_radii, points, irregular) if points < FEW_POINTS else self.most
+        if done >= most or not (done < due or polishing or left or now > self.stirred):
             return 0
-        return 1 if done == self.most - 1 or (polishing and done == polished - 1 and not dense) else 2
+        return 1 if done == most - 1 or (polishing and done == polished - 1 and not dense) else 2
+
+    def _most_of_few(self, distances: Sequence[float], noise_in_radii: float, points: int, irregular: bool) -> int:
+        if points < FEWEST_POINTS:
+            return 1
+        if noise_in_radii == 0.0:  # a scene
+            return self.most
+        start, left = distances[0], distances[1] if len(distances) > 1 else 0.0
+        if left > _STUCK_OF_FEW * start and start < _LOUD_DISTANCE:
+            return 1
+        if noise_in_radii >= _LARGE_NOISE_OF_FEW:
+            return self.most
+        little = irregular or noise_in_radii * points < _NOISE_OF_FEW
+        return 1 if little or left > max(_LEFT_OF_FEW * start, _SETTLED_OF_FEW) else 2
 
 
 def _has_left(thicknesses: Sequence[float]) -> bool:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.calibration import FEWEST_POINTS
 from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["MIN_POINTS", "DenoiseResult", "FinishedPatch", "Run"]
 
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
-# Of fewer points the network takes the shape for noise: `auto` makes one pass (docs/filter.md, "Few points").
-_FEW_POINTS = 500
 _PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
@@ -197,8 +196,8 @@ class Run:
             warnings.append("all points coincide: nothing to filter")
         elif found < MIN_POINTS:
             warnings.append(f"{counted}: nothing is filtered where they are fewer than {MIN_POINTS}")
-        elif found < _FEW_POINTS:
-            warnings.append(f"{counted}: of fewer than {_FEW_POINTS}, shape may be taken for noise")
+        elif found < FEWEST_POINTS:
+            warnings.append(f"{counted}: of fewer than {FEWEST_POINTS}, shape may be taken for noise")
         before = self.frame.radius * (self.readings[0].noise_std if self.readings else 0.0)
         after = self.frame.radius * self.noise_after
         return DenoiseResult(out, self.iterations, before, after, self.distances, untouched, seconds, tuple(warnings))
@@ -221,12 +220,12 @@ class Run:
     def _passes_left(self, planned: int | None) -> int:
         if planned is not None:
             return planned - self.iterations
-        if len(self.points.xyz) < _FEW_POINTS:
-            return 1 - self.iterations
         first, calibration = self.readings[0], self.filter.calibration
         left = (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
+            points=len(self.points.xyz),
+            irregular=first.sampling.irregular,
             thin_walls=first.sampling.thin_walls,
             shown_walls=self._rounds > ROUNDS,
             thicknesses=[reading.thickness for reading in self.readings],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.calibration import Calibration
+from straightpcf.model.calibration import FEW_POINTS, Calibration
 from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.noise import Reading
@@ -43,8 +43,8 @@ class Trace:
     """One noisy cloud on its way: d before each pass and after the last, CD from 0 passes on.
 
     noise_std: in radii, the std, or what else is the size of the noise; noise_type: as `benchmarks.shapes` names it;
-    noise_in_radii, thin_walls: of a patch, and of the cloud, what was read at the start; thicknesses: of the surface
-    before each pass and after the last, where it was read (`Reading`).
+    noise_in_radii, thin_walls, irregular: of a patch, and of the cloud, what was read at the start; thicknesses: of the
+    surface before each pass and after the last, where it was read (`Reading`); points: how many, as far as it matters.
     """
 
     cloud: str
@@ -55,10 +55,19 @@ class Trace:
     noise_in_radii: float = 0.0
     thin_walls: bool = False
     thicknesses: tuple[float, ...] = ()
+    points: int = FEW_POINTS
+    irregular: bool = False
 
     @classmethod
     def of(
-        cls, readings: Sequence[Reading], chamfer: Sequence[float], *, cloud: str, noise_std: float, noise_type: str
+        cls,
+        readings: Sequence[Reading],
+        chamfer: Sequence[float],
+        *,
+        cloud: str,
+        noise_std: float,
+        noise_type: str,
+        points: int,
     ) -> Trace:
         """Keep what was read before each pass and after the last, and CD from 0 passes on."""
         first = readings[0]
@@ -71,6 +80,8 @@ class Trace:
             first.noise_in_radii,
             first.sampling.thin_walls,
             tuple(reading.thickness for reading in readings),
+            points,
+            first.sampling.irregular,
         )
 
     @property
@@ -90,7 +101,7 @@ def trace(
     """Filter a noisy unit-sphere cloud (N, 3) pass by pass; clean: the same points without their noise."""
     states, readings = every_pass(filter_, noisy)
     chamfer = [chamfer_distance(x, clean) for x in states]
-    return Trace.of(readings, chamfer, cloud=name, noise_std=noise_std, noise_type=noise_type)
+    return Trace.of(readings, chamfer, cloud=name, noise_std=noise_std, noise_type=noise_type, points=len(noisy))
 
 
 def every_pass(
@@ -160,6 +171,8 @@ def passes(calibration: Calibration, recorded: Trace) -> int:
         left = calibration.passes_left(
             recorded.distances[: done + 1],
             recorded.noise_in_radii,
+            points=recorded.points,
+            irregular=recorded.irregular,
             thin_walls=recorded.thin_walls,
             thicknesses=recorded.thicknesses[: done + 1],
         )

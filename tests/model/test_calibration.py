@@ -51,6 +51,29 @@ def test_walls_that_a_pass_shows_get_four_passes() -> None:
     assert Calibration().passes_left((*of_walls, 0.43), shown_walls=True) == 0
 
 
+@pytest.mark.parametrize(
+    ("distances", "noise_in_radii", "irregular", "most"),
+    [
+        ((0.34, 0.14), 0.010, False, 1),  # little noise, read of bends
+        ((0.69, 0.15), 0.025, False, 2),
+        ((0.69, 0.40), 0.025, False, 1),
+        ((0.28, 0.17), 0.016, False, 2),  # a scan, with noise along its beams
+        ((0.60, 0.26), 0.025, True, 1),
+        ((0.95, 0.49), 0.050, True, 5),
+        ((0.90, 0.82), 0.051, True, 1),  # fins
+        ((0.96, 0.90), 0.051, True, 5),  # 8 % of noise
+    ],
+)
+def test_few_points_get_no_more_passes_than_their_noise_asks_for(
+    distances: tuple[float, ...], noise_in_radii: float, irregular: bool, most: int
+) -> None:
+    shipped = Calibration(starts=(0.21, 0.75, 0.9), polish=(0.35, 0.62), settled=(0.18, 0.3), stuck=0.64, most=5)
+    stirred = (0.6,) * 4
+    many = Trace("cloud", 0.01, (*distances, *stirred), (), noise_in_radii=noise_in_radii, irregular=irregular)
+    counts = (1000, 400, 5000)
+    assert [passes(shipped, replace(many, points=count)) for count in counts] == [most, 1, 5]
+
+
 def test_of_dense_points_a_third_pass_is_made_where_the_second_leaves_more() -> None:
     distances = (0.58, 0.19, 0.12, 0.12, 0.12)
     few, dense = (

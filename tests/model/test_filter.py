@@ -16,7 +16,7 @@ from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
-from tests.clouds import distance_to_torus, far_group, noisy, sphere, torus
+from tests.clouds import distance_to_torus, even_sphere, far_group, noisy, sphere, torus
 
 ONE_PASS = DenoiseOptions(iterations=1)
 
@@ -100,12 +100,26 @@ def test_rows_may_be_far_out_or_all_be_huge(tiny: Filter) -> None:
     assert np.isfinite(huge.xyz).all()
 
 
-def test_few_points_get_one_pass_of_auto_and_a_warning(shipped: Filter) -> None:
+def test_the_fewest_points_get_one_pass_of_auto_and_a_warning(shipped: Filter) -> None:
     few = shipped.denoise(noisy(torus(300), 0.01))
     assert few.iterations == 1
     assert "300 points" in few.warnings[0]
     assert shipped.denoise(noisy(torus(300), 0.01), DenoiseOptions(iterations=2)).iterations == 2
     assert shipped.denoise(noisy(torus(600), 0.02)).warnings == ()
+
+
+def test_few_points_get_further_passes_where_these_take_noise_not_shape(shipped: Filter) -> None:
+    along = np.random.default_rng(1).uniform(-1, 1, (700, 2))
+    plates = np.column_stack([along, 0.3 * (np.arange(700) % 5) - 0.6])  # as far apart as two of their points
+    passes = {
+        "plates": shipped.denoise(noisy(plates, 0.01)).iterations,
+        "by chance": shipped.denoise(noisy(torus(1500), 0.02)).iterations,
+        "even": shipped.denoise(noisy(even_sphere(1500), 0.03)).iterations,
+        "loud": shipped.denoise(noisy(even_sphere(1500), 0.08)).iterations,
+    }
+    assert passes["plates"] == passes["by chance"] == 1
+    assert passes["even"] == 2
+    assert passes["loud"] > 2
 
 
 def test_patches_add_up_to_the_result_whatever_the_thread_count(tiny: Filter) -> None:
