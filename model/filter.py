@@ -16,6 +16,7 @@ from straightpcf.model.calibration import Calibration
 from straightpcf.model.checkpoint import load_checkpoint, read_checkpoint
 from straightpcf.model.cpus import usable_cpus, use_one_thread_if_forked
 from straightpcf.model.nets.straightpcf import StraightPCF
+from straightpcf.model.objects import begin
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
 from straightpcf.model.processor import First, Processor
@@ -203,7 +204,7 @@ class Filter:
 
         Numbers of other types become float64. Raises TooFewPoints below MIN_POINTS finite rows, InvalidCloud.
         """
-        run = Run(self, xyz, options or DenoiseOptions())
+        run = begin(self, xyz, options or DenoiseOptions())
         began = time.monotonic()
         for patch in run.patches():
             if on_progress is not None:
@@ -217,4 +218,4 @@ class Filter:
 
         Rows that are not finite belong to no patch. Order and batching never change a position.
         """
-        return Run(self, xyz, options or DenoiseOptions()).patches()
+        return begin(self, xyz, options or DenoiseOptions()).patches()

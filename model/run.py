@@ -180,12 +180,7 @@ class Run:
         if self.iterations:  # else even the sign of a zero stays
             out[self.rows] += self.options.strength * self.frame.radius * self.moved[self.points.inverse]
         untouched = len(out) - len(self.rows)
-        warnings = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
-        if self.far_out_count:
-            farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
-            warnings.append(f"{self.far_out_count} points are {farther} and were passed through")
-        if self.apart_count:
-            warnings.append(f"{self.apart_count} points lie apart from all others and were passed through")
+        warnings = self.passed_through()
         if held_back := np.count_nonzero(self.held_back[self.points.inverse]):
             warnings.append(f"{held_back} points are on walls closer together than points are, and were held back")
         if self.steps:
@@ -201,6 +196,16 @@ class Run:
         before = self.frame.radius * (self.readings[0].noise_std if self.readings else 0.0)
         after = self.frame.radius * self.noise_after
         return DenoiseResult(out, self.iterations, before, after, self.distances, untouched, seconds, tuple(warnings))
+
+    def passed_through(self) -> list[str]:
+        """Return what is said of rows that are not filtered."""
+        said = [f"{self.not_finite} points are not finite and were passed through"] if self.not_finite else []
+        if self.far_out_count:
+            farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
+            said.append(f"{self.far_out_count} points are {farther} and were passed through")
+        if self.apart_count:
+            said.append(f"{self.apart_count} points lie apart from all others and were passed through")
+        return said
 
     def _noise_left(self, tiles: list[npt.NDArray[np.int64]]) -> float:
         """Return the noise std of what comes out: of a scene, and of points that go a part of their way, read anew."""

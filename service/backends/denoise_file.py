@@ -87,10 +87,10 @@ def _filtered(
     denoiser: Filter, cloud: PointCloud, job: FileJob, on_progress: OnProgress | None, on_preview: OnPreview | None
 ) -> DenoiseResult:
     """Filter a cloud, and tell of each patch as it is finished; the patches are in their file when this returns."""
-    from straightpcf.model.filter import Run
+    from straightpcf.model.objects import begin
 
     began = time.monotonic()
-    run, preview = Run(denoiser, cloud.xyz, job.options), _Preview(len(cloud), on_preview)
+    run, preview = begin(denoiser, cloud.xyz, job.options), _Preview(len(cloud), on_preview)
     with _PatchFile(job.patches) if job.patches is not None else nullcontext() as patches:
         if patches is not None:
             patches.write(encode_header(len(cloud)))

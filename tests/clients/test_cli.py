@@ -105,7 +105,7 @@ def test_exit_codes(arguments: list[str], code: int, text: str, scan: Path, monk
 def test_a_result_that_could_not_be_written_is_refused_before_anything_is_filtered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("straightpcf.model.filter.Run", lambda *_: pytest.fail("it is filtered"))
+    monkeypatch.setattr("straightpcf.model.objects.begin", lambda *_: pytest.fail("it is filtered"))
     np.save(cloud := tmp_path / "a.npy", np.vstack([noisy(torus(POINTS), 0.01), np.full((1, 3), np.nan)]))
     done = CliRunner().invoke(app, ["denoise", str(cloud), str(tmp_path / "b.las"), "--device", "cpu"])
     assert (done.exit_code, done.stderr.split(":")[0]) == (3, "error [unsupported_cloud]")
