@@ -33,6 +33,7 @@ Floats = npt.NDArray[np.float64]
 # coarser ones what is apart touches, in finer ones a surface falls into pieces.
 _CELLS, _LEAST_SHARED = (64, 32, 16, 8), 10
 _MOST_PIECES = 256  # what falls into more large ones is no shelf of objects
+_BLOCK = 2**16  # points whose cells are looked up at once
 
 
 def separate_objects(xyz: Floats) -> list[npt.NDArray[np.int64]]:
@@ -74,8 +75,9 @@ def _pieces(xyz: Floats) -> npt.NDArray[np.int64]:
     low, high = box_of(xyz)
     side = float((high - low).max())
     for cells in _CELLS if side > 0 else ():
-        index = np.minimum((xyz - low) * (cells / side), cells - 1).astype(np.int64)
-        flat = np.ravel_multi_index(tuple(index.T), (cells,) * 3)
+        blocks = (xyz[start : start + _BLOCK] - low for start in range(0, len(xyz), _BLOCK))
+        indices = (np.minimum(block * (cells / side), cells - 1).astype(np.int64) for block in blocks)
+        flat = np.concatenate([np.ravel_multi_index(tuple(index.T), (cells,) * 3) for index in indices])
         points = np.bincount(flat, minlength=cells**3)
         if np.median(points[flat]) > _LEAST_SHARED:
             numbers, _ = label(points.reshape((cells,) * 3) > 0, structure=np.ones((3, 3, 3)))
@@ -100,7 +102,7 @@ class RunOfObjects:
 
     def __init__(self, whole: Run, objects: list[npt.NDArray[np.int64]]) -> None:
         """Take the cloud, not begun, and which of its distinct points each object has."""
-        self._whole = whole
+        self._xyz, self._passed_through = whole.xyz, whole.passed_through()  # not what it has of the cloud as one
         self._rows = [whole.rows[whole.points.copies(rows.astype(np.int32))] for rows in objects]
         self._runs = [Run(whole.filter, whole.xyz[rows], whole.options) for rows in self._rows]
 
@@ -130,7 +132,7 @@ class RunOfObjects:
         parts = [run.result(seconds) for run in self._runs]
         sizes = np.array([len(rows) for rows in self._rows])
         longest = max(range(len(parts)), key=lambda number: (parts[number].iterations, sizes[number]))
-        out = self._whole.xyz.copy()
+        out = self._xyz.copy()
         for rows, part in zip(self._rows, parts, strict=True):
             out[rows] = part.xyz
         before, after = (
@@ -139,7 +141,7 @@ class RunOfObjects:
         )
         said = [warning for part in parts for warning in part.warnings]
         warnings = [
-            *self._whole.passed_through(),
+            *self._passed_through,
             f"the cloud is {len(parts)} objects far from each other: each was filtered as if it were alone",
             *(f"in one of them {warning}" for warning in said),
         ]

@@ -36,6 +36,7 @@ NOT_TUNED = {
     "normals.py": {"_CHUNK"},
     "on_device.py": {"_BATCH", "_ASKED", "_ROWS", "_MOST_GRAPHS", "_IN_FLIGHT", "_MOST_THREADS"},
     "ops.py": {"_DIRECT"},
+    "objects.py": {"_BLOCK"},
     "outliers.py": {"_BLOCK"},
     "patches.py": {"_TREE_HEIGHT"},
     "restraint.py": {"_LINE_FREEDOM"},  # of a mean and a direction

@@ -109,7 +109,7 @@ def every_pass(
 ) -> tuple[list[npt.NDArray[np.float64]], list[Reading]]:
     """Return what the filter makes of a cloud (N, 3) with 0, 1, ... passes, and what it reads before each and last.
 
-    As many passes as `calibrate` knows of.
+    As many passes as `calibrate` knows of; all points are taken for one object.
     """
     run = Run(filter_, noisy, DenoiseOptions(iterations=max(_LIMITS["most"]), seed=seed))
     states = {0: noisy}

@@ -19,15 +19,7 @@ from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import MAX_FIELDS, PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
-from straightpcf.points.formats.text import (
-    Lines,
-    as_integers,
-    as_numbers,
-    blocks,
-    refuse_binary,
-    replaced,
-    shown,
-)
+from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, refuse_binary, replaced, shown
 
 __all__ = ["Pcd"]
 
