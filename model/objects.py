@@ -43,7 +43,10 @@ def separate_objects(xyz: Floats) -> list[npt.NDArray[np.int64]]:
     each other or a street's houses are parts of one. Groups of fewer than FEWEST_POINTS belong to the nearest object.
     """
     whole = [np.arange(len(xyz))]
-    pieces = _rows_of(_pieces(xyz))
+    numbers = _pieces(xyz)
+    if not numbers.any():  # as of nearly every cloud: spare it the sorting
+        return whole
+    pieces = _rows_of(numbers)
     large = [rows for rows in pieces if len(rows) >= FEWEST_POINTS]
     if not 2 <= len(large) <= _MOST_PIECES:
         return whole

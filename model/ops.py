@@ -6,7 +6,7 @@ import torch
 
 from straightpcf.model.kernels import cpu
 
-__all__ = ["edge_max", "edge_max_torch", "for_products", "knn", "knn_torch", "squared_distances"]
+__all__ = ["edge_max", "edge_max_torch", "knn", "knn_torch", "squared_distances"]
 
 _DIRECT = 8  # of fewer channels distances are differences, and products are exact
 
@@ -54,18 +54,6 @@ def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return distance
 
 
-def for_products(x: torch.Tensor) -> torch.Tensor:
-    """Return features (..., C) float32 as the layers per point take them: on a GPU without gradient in float16.
-
-    So are the products over edges that come of them; sums are of float32, and positions stay as they are.
-    """
-    if not x.is_cuda or torch.is_grad_enabled() or x.shape[-1] < _DIRECT:
-        return x
-    from straightpcf.model.kernels import cuda
-
-    return x.half() if cuda.load() else x
-
-
 def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Take the maximum over a point's edges of the second layer of an EdgeConv.
 
@@ -75,16 +63,16 @@ def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torc
     want_grad = torch.is_grad_enabled() and any(t.requires_grad for t in (a, b, weight))
     whole = a.shape[2] % 16 == 0 and weight.shape[0] % 16 == 0
     if a.is_cuda and whole:
-        from straightpcf.model.kernels import cuda
+        from straightpcf.model.kernels import cuda, cuda_gradient
 
         if not want_grad and cuda.load():
             return cuda.edge_max(a, b, index.int(), weight)
-        if want_grad and index.shape[2] == cuda.EDGES and cuda.load_gradient():
-            return cuda.EdgeMax.apply(a, b, index.int(), weight)  # type: ignore[no-untyped-call,no-any-return]
+        if want_grad and index.shape[2] == cuda_gradient.EDGES and cuda_gradient.load_gradient():
+            return cuda_gradient.EdgeMax.apply(a, b, index.int(), weight)  # type: ignore[no-untyped-call,no-any-return]
     plain = whole and a.dtype == torch.float32 and index.dtype == torch.int32
     library = cpu.load() if plain and a.device.type == "cpu" else None
     if library is None:
-        return edge_max_torch(a.to(weight.dtype), b.to(weight.dtype), index, weight)
+        return edge_max_torch(a, b, index, weight)
     return cpu.EdgeMax.apply(library, a, b, index, weight, want_grad)  # type: ignore[no-untyped-call,no-any-return]
 
 

@@ -33,7 +33,7 @@ def split(xyz: npt.NDArray[np.float64], tile_points: int) -> list[npt.NDArray[np
     while left:
         rows = left.pop()
         if len(rows) <= tile_points:
-            tiles.append(np.sort(rows))
+            tiles.append(rows if len(rows) == len(xyz) else np.sort(rows))
             continue
         low, high = box_of(xyz[rows])
         axis = int(np.argmax(high - low))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
@@ -19,6 +19,7 @@ from torch.nn.utils.fusion import fuse_linear_bn_weights
 from straightpcf.model.kernels import cpu
 
 if TYPE_CHECKING:
+    from straightpcf.model.kernels.fused_cuda import FusedOnDevice
     from straightpcf.model.nets.edgeconv import Decoder, EdgeConv, Encoder
 
 __all__ = ["Fused", "fused"]
@@ -95,18 +96,29 @@ class Fused:
         yield nn.functional.pad(bias, (0, rows)).contiguous()
 
 
-_KNOWN: weakref.WeakKeyDictionary[nn.Module, tuple[object, Fused]] = weakref.WeakKeyDictionary()
+_KNOWN: weakref.WeakKeyDictionary[nn.Module, tuple[object, Fused | FusedOnDevice]] = weakref.WeakKeyDictionary()
 
 
-def fused(module: nn.Module, encoder: Encoder, decoder: Decoder, x: torch.Tensor, neighbours: int) -> Fused | None:
+def fused(
+    module: nn.Module, encoder: Encoder, decoder: Decoder, x: torch.Tensor, neighbours: int
+) -> Fused | FusedOnDevice | None:
     """Return what does as a module does that is `encoder`, then `decoder`, on patches like x; None where nothing does.
 
     Packed anew where a weight has changed.
     """
-    if torch.is_grad_enabled() or decoder.training or x.device.type != "cpu" or x.dtype != torch.float32:
+    if torch.is_grad_enabled() or decoder.training or x.dtype != torch.float32 or x.shape[1] < 2:
         return None
-    library = cpu.load()
-    if library is None or x.shape[1] < 2:
+    library = cpu.load() if x.device.type == "cpu" else None
+    pack: Callable[[Encoder, Decoder, int], Fused | FusedOnDevice]
+    if library is not None:
+        pack = partial(Fused, library)
+    elif x.is_cuda:
+        from straightpcf.model.kernels import fused_cuda  # a GPU's, which not every process has
+
+        if not fused_cuda.takes(encoder, x, neighbours):
+            return None
+        pack = fused_cuda.FusedOnDevice
+    else:
         return None
     tensors = [*module.parameters(), *module.buffers()]
     if any(each.is_inference() for each in tensors):  # made in inference mode: nothing tells when they change
@@ -114,7 +126,7 @@ def fused(module: nn.Module, encoder: Encoder, decoder: Decoder, x: torch.Tensor
     state = (id(library), *((each.data_ptr(), each._version) for each in tensors))
     known = _KNOWN.get(module)
     if known is None or known[0] != state:
-        known = _KNOWN[module] = (state, Fused(library, encoder, decoder, neighbours))
+        known = _KNOWN[module] = (state, pack(encoder, decoder, neighbours))
     return known[1]
 
 

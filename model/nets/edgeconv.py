@@ -6,8 +6,9 @@ from typing import cast
 
 import torch
 from torch import nn
+from torch.nn.functional import linear
 
-from straightpcf.model.ops import edge_max, for_products, knn
+from straightpcf.model.ops import edge_max, knn
 
 __all__ = ["NEIGHBOURS", "Decoder", "EdgeConv", "Encoder"]
 
@@ -26,14 +27,13 @@ class EdgeConv(nn.Module):
     def forward(self, x: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
         """Map x (B, P, C) to (B, M, D) for the M points whose neighbours `index` (B, M, k) holds."""
         first, second = cast(nn.Linear, self.mlp[0]), cast(nn.Linear, self.mlp[2])
-        x = for_products(x)
         rows = x[:, : index.shape[1]]
         # [x_i, x_j - x_i] W = x_i (W_a - W_b) + x_j W_b: the first layer runs per point, not per edge.
         own, other = first.weight[:, : x.shape[2]], first.weight[:, x.shape[2] :]
-        a = _linear(rows, own - other, first.bias)
-        b = _linear(x, other)
+        a = linear(rows, own - other, first.bias)
+        b = linear(x, other)
         edges = edge_max(a, b, index, second.weight) + second.bias
-        skip = _linear(rows, self.lin.weight, self.lin.bias)
+        skip = self.lin(rows)
         return torch.relu(edges) + torch.relu(skip) if self.activation else edges + skip
 
 
@@ -71,13 +71,8 @@ class Decoder(nn.Module):
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Map (B, M, D) to (B, M, out), or to (B, out) with `pool`."""
-        h = for_products(features).flatten(0, 1)
-        h = self.dropout(torch.relu(self.bn_1_out(_linear(h, self.lin_1.weight, self.lin_1.bias))))
-        h = self.dropout(torch.relu(self.bn_2_out(_linear(h, self.lin_2.weight, self.lin_2.bias))))
-        h = h.unflatten(0, features.shape[:2]).to(features.dtype)  # (B, M, 64)
+        h = features.flatten(0, 1)
+        h = self.dropout(torch.relu(self.bn_1_out(self.lin_1(h))))
+        h = self.dropout(torch.relu(self.bn_2_out(self.lin_2(h))))
+        h = h.unflatten(0, features.shape[:2])  # (B, M, 64)
         return self.lin_3(h.amax(dim=1) if self.pool else h)  # type: ignore[no-any-return]
-
-
-def _linear(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-    """Do what a linear layer does in the precision of x."""
-    return nn.functional.linear(x, weight.to(x.dtype), None if bias is None else bias.to(x.dtype))

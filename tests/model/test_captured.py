@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from straightpcf.model.filter import Filter
-from straightpcf.model.kernels import cuda
+from straightpcf.model.kernels import cuda, cuda_gradient
 from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.on_device import OnDevice, _DeviceCut, _Heard
 from straightpcf.model.patches import Patches
@@ -67,21 +67,27 @@ def shapes_for_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     def edge_max(a: torch.Tensor, b: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         return a.new_empty((*a.shape[:2], len(weight)))
 
+    def edge_conv(a: torch.Tensor, *others: torch.Tensor, activation: bool) -> torch.Tensor:
+        *_, half = others
+        return half.new_empty(half.shape if activation else 0, dtype=torch.float32)
+
     for name, shaped in {
         "load": lambda: True,
-        "load_gradient": lambda: cuda.triton is not None,
         "knn": knn,
         "edge_max": edge_max,
+        "edge_conv": edge_conv,
     }.items():
         monkeypatch.setattr(cuda, name, shaped)
-    for kernel in ("_edge_max", "_hidden_gradient", "_weight_gradient"):  # of `EdgeMax`
-        monkeypatch.setattr(cuda, kernel, Launched(), raising=False)
+    monkeypatch.setattr(cuda_gradient, "load_gradient", lambda: cuda.triton is not None)
+    monkeypatch.setattr(cuda, "_edge_max", Launched(), raising=False)
+    for kernel in ("_hidden_gradient", "_weight_gradient"):
+        monkeypatch.setattr(cuda_gradient, kernel, Launched(), raising=False)
     monkeypatch.setattr(torch, "_standard_gamma", torch.empty_like)  # torch 2.11 does not know its shape
 
 
 def on_device() -> StraightPCF:
-    with DEVICE:
-        return StraightPCF(width=64, distance_width=64).eval()
+    with DEVICE:  # widths that the kernels take
+        return StraightPCF(width=128, distance_width=128).eval()
 
 
 @pytest.mark.parametrize("read_before", [False, True])

@@ -16,8 +16,11 @@ pytest.importorskip("triton", reason="Triton is not installed: pip install trito
 _COMPARE = """
 import torch
 from straightpcf.model import device_patches, ops
-from straightpcf.model.kernels import cuda
+from straightpcf.model.kernels import cuda, cuda_gradient
+from straightpcf.model.kernels.fused_cuda import FusedOnDevice
+from straightpcf.model.nets.straightpcf import DistanceModule, VelocityModule
 
+torch.manual_seed(0)
 device = "cuda" if torch.cuda.is_available() else "cpu"
 generator = torch.Generator().manual_seed(0)
 for points, channels, k, rows in ((200, 3, 32, 7), (200, 3, 16, 5), (130, 32, 32, 5), (333, 64, 32, 3),
@@ -37,7 +40,15 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     index = ops.knn_torch(b, 32, 22)
     found, expected = cuda.edge_max(a[:, :22], b, index.int(), weight), ops.edge_max_torch(a[:, :22], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
-for prove in (cuda._prove, cuda._prove_gradient):
+for module in (VelocityModule(128).eval(), DistanceModule(128).eval()):
+    whole = FusedOnDevice(module.to(device).encoder, module.decoder, 32)
+    x = torch.randn(2, 40, 3, generator=generator).to(device) * 0.2
+    for rows in (None, 17)[: 2 if isinstance(module, VelocityModule) else 1]:
+        with torch.no_grad():
+            found, expected = whole(x, rows), module.decoder(module.encoder(x, rows))
+        assert found.shape == expected.shape and found.dtype == torch.float32
+        assert (found - expected).norm() / expected.norm() < 3e-2, (type(module), rows)
+for prove in (cuda._prove, cuda_gradient._prove_gradient):
     prove(torch.device(device), 1000 if device == "cuda" else 34)
 cloud = torch.randn(9000, 3, generator=generator).to(device)
 for wanted, first in ((1, 0), (8, 1), (8, 8999)):
@@ -51,7 +62,7 @@ _COMPILE = """
 import torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
-from straightpcf.model.kernels import cuda
+from straightpcf.model.kernels import cuda, cuda_gradient
 
 class Hopper:
     def get_current_target(self): return GPUTarget("cuda", 90, 32)
@@ -71,13 +82,16 @@ for points, channels, k, rows in ((1000, 3, 32, 1000), (1000, 3, 16, 401), (1000
 for width in (16, 32, 64, 128, 256):
     a, b, index = torch.zeros(2, 384, width), torch.zeros(2, 1000, width), torch.zeros(2, 384, 32, dtype=torch.int32)
     cuda.edge_max(a, b, index, torch.zeros(width, width))
+    weight, half = torch.zeros(width, width).half(), torch.zeros(2, 384, 2 * width).half()[:, :, :width]
+    cuda.edge_conv(a, b, a, index, weight, torch.zeros(width), half, activation=width < 128)
 for count, wanted, first in ((50_000, 150, 0), (50_000, 150, 1), (50_000, 150, 7), (333, 1, 1)):
     cuda.farthest(torch.zeros(count, 3), wanted, first)
 for width, rows in ((32, 1000), (256, 256)):
     a, b = torch.zeros(2, rows, width), torch.zeros(2, 1000, width)
     index = torch.zeros(2, rows, 32, dtype=torch.int32)
-    cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(width, width)), index, torch.ones(2, rows, width))
-assert len(made) == 22, made
+    of = a, b, torch.zeros(width, width)
+    cuda_gradient._gradients(cuda_gradient.EdgeMax.apply, of, index, torch.ones(2, rows, width))
+assert len(made) == 31, made
 assert all(kernel.asm["cubin"] and kernel.metadata.shared <= 227 * 1024 for kernel in made)
 
 # A gaming card has 99 KiB.
@@ -86,7 +100,7 @@ Hopper.get_current_device = lambda self: 1
 cuda._room = lambda device: 99 * 1024
 made.clear()
 a, b, index = torch.zeros(2, 384, 256), torch.zeros(2, 1000, 256), torch.zeros(2, 384, 32, dtype=torch.int32)
-cuda._gradients(cuda.EdgeMax.apply, (a, b, torch.zeros(256, 256)), index, torch.ones(2, 384, 256))
+cuda_gradient._gradients(cuda_gradient.EdgeMax.apply, (a, b, torch.zeros(256, 256)), index, torch.ones(2, 384, 256))
 assert [kernel.metadata.shared <= 99 * 1024 for kernel in made] == [True] * 3, made
 print("compiled")
 """
