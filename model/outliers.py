@@ -30,6 +30,11 @@ _MOST_SHARE = 0.1  # of the points; where more seem to belong to nothing, the cl
 # What is sparse beside the rest may be a surface all the same: its points are as far apart as their neighbours
 # are, and lie in a sheet or a line with them (their least std beside the next; of points in a volume 0.6).
 _SHEET_NEIGHBOURS, _SHEET_FLATNESS, _SHEET_SHARE, _SHEET_NEIGHBOUR_RATIO = 16, 0.35, 0.5, 2.0
+# Where points in the air are many, nine tenths of all have their 8th neighbour so many times as far as half. Those with
+# it twice as far as half, if they are so many, are in the air where their nearest among each other fill a volume, which
+# those of a sparse part of a surface do not.
+_MANY_SPREAD, _LOOSE_RATIO, _LEAST_MANY, _MOST_MANY = 2.4, 2.0, 0.105, 0.45
+_LEAST_COUNT, _VOLUME_NEIGHBOURS, _VOLUME_FLATNESS, _VOLUME_SHARE = 500, 48, 0.5, 0.5
 _PROBES = 48
 _BLOCK = 2**16  # points whose neighbours are held at once
 
@@ -50,28 +55,47 @@ def far_out(xyz: Floats) -> npt.NDArray[np.bool_]:
 def isolated(xyz: Floats, *, workers: int = 1, spacings: tuple[Floats, Floats] | None = None) -> npt.NDArray[np.bool_]:
     """Say of each point of an object (N, 3) whether it lies apart from all others: (N,).
 
-    None does in a scene, whose far parts are sparse, and where more than _MOST_SHARE would. Where some do, everyone's
-    patches have a few, which read as noise that the whole cloud has. spacings: (N,) each, where they are known: how far
-    each point's 8th neighbour is, and the median of what that is of its 8 nearest.
+    None does in a scene, whose far parts are sparse, and where more than _MOST_SHARE would, unless these fill a volume.
+    Where some do, everyone's patches have a few, which read as noise that the whole cloud has. spacings: (N,) each,
+    where they are known: how far each point's 8th neighbour is, and the median of what that is of its 8 nearest.
     """
-    beside_most, beside_neighbours = _beside(*(spacings or _spacings(xyz, workers)))
-    apart = (beside_most > _FAR_RATIO) | (beside_neighbours > _FAR_NEIGHBOUR_RATIO)
-    sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _SHEET_NEIGHBOUR_RATIO), workers)
-    apart &= ~sheet
-    few = apart.mean() < _FEW_SHARE
-    if few:
-        apart = (beside_most > _ALONE_RATIO) & ~sheet
+    reach, among = spacings or _spacings(xyz, workers)
+    apart, sheet, few = _many_apart(xyz, reach, workers), np.zeros(len(xyz), dtype=bool), False
+    most = _MOST_MANY if apart.any() else _MOST_SHARE
+    if not apart.any():
+        beside_most, beside_neighbours = _beside(reach, among)
+        apart = (beside_most > _FAR_RATIO) | (beside_neighbours > _FAR_NEIGHBOUR_RATIO)
+        sheet = _on_a_sheet(xyz, apart & (beside_neighbours < _SHEET_NEIGHBOUR_RATIO), workers)
+        apart &= ~sheet
+        if few := bool(apart.mean() < _FEW_SHARE):
+            apart = (beside_most > _ALONE_RATIO) & ~sheet
     if not apart.any():
         return apart
-    if apart.mean() > _MOST_SHARE or _is_scene(xyz[~apart]):
+    if apart.mean() > most or _is_scene(xyz[~apart]):
         return np.zeros_like(apart)
     for _ in range(0 if few else _ROUNDS):
         rows = np.flatnonzero(~apart)
         beside_most, beside_neighbours = _beside(*_spacings(xyz[rows], workers))
         found = ((beside_most > _NEXT_RATIO) | (beside_neighbours > _NEXT_NEIGHBOUR_RATIO)) & ~sheet[rows]
-        if not found.any() or apart.sum() + found.sum() > _MOST_SHARE * len(xyz):
+        if not found.any() or apart.sum() + found.sum() > most * len(xyz):
             break
         apart[rows[found]] = True
+    return apart
+
+
+def _many_apart(xyz: Floats, reach: Floats, workers: int) -> npt.NDArray[np.bool_]:
+    """Say of each point (N, 3) whether it is one of many in the air, (N,); reach: (N,) of its 8th neighbour."""
+    apart = np.zeros(len(xyz), dtype=bool)
+    middle = np.median(reach)
+    if np.quantile(reach, _DENSE_QUANTILE) < _MANY_SPREAD * middle:  # as of nearly every cloud
+        return apart
+    loose = reach > _LOOSE_RATIO * middle
+    if loose.sum() < _LEAST_COUNT or not _LEAST_MANY <= loose.mean() <= _MOST_MANY or _is_scene(xyz[~loose]):
+        return apart
+    rows = np.flatnonzero(loose)
+    around, flatness = _looked_around(xyz[rows], xyz[rows], _VOLUME_NEIGHBOURS, workers)
+    found = rows[(flatness > _VOLUME_FLATNESS)[around].mean(axis=1) > _VOLUME_SHARE]
+    apart[found] = len(found) >= _LEAST_MANY * len(xyz)
     return apart
 
 
@@ -101,21 +125,29 @@ def _on_a_sheet(xyz: Floats, asked: npt.NDArray[np.bool_], workers: int) -> npt.
 
     Those nearest to it lie in one, and so do those nearest to most of them: a few points lie flat by chance.
     """
-    flat = np.zeros(len(xyz), dtype=bool)
+    flat, sheet = np.zeros(len(xyz), dtype=bool), np.zeros(len(xyz), dtype=bool)
     if not asked.any():  # as of nearly every cloud: spare it another tree
-        return flat
-    rows, tree = np.flatnonzero(asked), cKDTree(xyz)
-    around = np.empty((len(rows), min(_SHEET_NEIGHBOURS, len(xyz))), dtype=np.int32)
-    for start in range(0, len(rows), _BLOCK):
+        return sheet
+    rows = np.flatnonzero(asked)
+    around, flatness = _looked_around(xyz, xyz[rows], _SHEET_NEIGHBOURS, workers)
+    flat[rows] = flatness < _SHEET_FLATNESS
+    sheet[rows] = flat[around].mean(axis=1) > _SHEET_SHARE
+    return sheet
+
+
+def _looked_around(xyz: Floats, places: Floats, count: int, workers: int) -> tuple[npt.NDArray[np.int32], Floats]:
+    """Return which of points (N, 3) are nearest to places (M, 3), (M, count), and their least std by the next, (M,)."""
+    tree = cKDTree(xyz)
+    around = np.empty((len(places), min(count, len(xyz))), dtype=np.int32)
+    flatness = np.empty(len(places))
+    for start in range(0, len(places), _BLOCK):
         some = slice(start, start + _BLOCK)
-        around[some] = tree.query(xyz[rows[some]], k=np.arange(1, around.shape[1] + 1), workers=workers)[1]
+        around[some] = tree.query(places[some], k=np.arange(1, around.shape[1] + 1), workers=workers)[1]
         near = xyz[around[some]]
         near -= near.mean(axis=1, keepdims=True)
         least, following, _ = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near).T
-        flat[rows[some]] = least < _SHEET_FLATNESS**2 * following
-    sheet = np.zeros(len(xyz), dtype=bool)
-    sheet[rows] = flat[around].mean(axis=1) > _SHEET_SHARE
-    return sheet
+        flatness[some] = np.sqrt(np.maximum(least, 0.0) / np.maximum(following, 1e-300))
+    return around, flatness
 
 
 def _is_scene(xyz: Floats) -> bool:

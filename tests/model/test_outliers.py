@@ -70,6 +70,35 @@ def test_a_sparse_surface_beside_a_dense_one_belongs_to_the_cloud() -> None:
     assert apart[10_000:].mean() > 0.8
 
 
+@pytest.mark.parametrize(("share", "noise_std"), [(0.15, 0.005), (0.3, 0.005), (0.3, 0.02), (0.5, 0.01)])
+def test_many_points_in_the_air_are_found_as_few_are(share: float, noise_std: float) -> None:
+    air = in_the_air(round(10_000 * share), 1.4)
+    apart = isolated(np.vstack([noisy(torus(10_000), noise_std), air]))
+    assert apart[:10_000].mean() < 0.001
+    away = distance_to_torus(air) > 0.2
+    assert apart[10_000:][away].mean() > 0.95
+
+
+def test_many_points_in_the_air_change_little_for_the_others(
+    shipped: Filter, filtered_alone: Callable[[float], tuple[np.ndarray, DenoiseResult]]
+) -> None:
+    rough, alone = filtered_alone(0.01)
+    together = shipped.denoise(np.vstack([rough, in_the_air(1500, 1.4)]))
+    rms = [np.sqrt(np.square(distance_to_torus(r.xyz[:5000])).mean()) for r in (alone, together)]
+    assert rms[1] < 1.4 * rms[0]
+    assert together.untouched > 1000
+
+
+@pytest.mark.parametrize("noise_std", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("rest", [4, 16])
+def test_a_part_with_fewer_points_is_no_air(noise_std: float, rest: int) -> None:
+    whole = torus(40_000)
+    kept = (whole[:, 0] < 0.2) | (np.arange(len(whole)) % rest == 0)
+    fading = np.random.default_rng(2).random(len(whole)) < np.exp(-1.5 * (whole[:, 0] + 1.4))
+    for part in (kept, fading):
+        assert isolated(noisy(whole[part], noise_std)).mean() < 0.01
+
+
 def test_one_point_far_away_does_not_make_an_object_a_scene() -> None:
     with_it = np.vstack([torus(5000), [[40.0, 0, 0]]])
     assert np.flatnonzero(isolated(with_it)).tolist() == [5000]
