@@ -39,7 +39,13 @@ class Health:
 
 @dataclass(frozen=True, kw_only=True)
 class ServerInfo:
-    """Tell what a server is and takes; formats by name."""
+    """Tell what a server is and takes; formats by name.
+
+    max_bytes: of one request body.  max_points: of one cloud.  max_jobs, max_queued_points: jobs, and points of them
+    all, that wait and run at once, over all keys.  max_iterations: of one job.
+    max_sync_seconds: how long POST /denoise waits before it answers with the job instead of the result.
+    result_ttl_seconds: how long a finished job's files are kept.
+    """
 
     version: str
     model: str
@@ -48,7 +54,10 @@ class ServerInfo:
     max_bytes: int
     max_points: int
     max_jobs: int
+    max_queued_points: int
     max_iterations: int
+    max_sync_seconds: float
+    result_ttl_seconds: float
     formats: tuple[str, ...]
 
 
@@ -59,7 +68,10 @@ def parse_health(body: Mapping[str, Any]) -> Health:
 
 def parse_info(body: Mapping[str, Any]) -> ServerInfo:
     """Read GET /v1/info; what a newer server adds is left out."""
-    plain = ("version", "model", "weights", "max_bytes", "max_points", "max_jobs", "max_iterations")
+    plain = (
+        "version", "model", "weights", "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_iterations",
+        "max_sync_seconds", "result_ttl_seconds",
+    )  # fmt: skip
     return ServerInfo(
         **{name: body[name] for name in plain},
         devices=tuple(body["devices"]),

@@ -7,10 +7,12 @@ import io
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 
@@ -179,6 +181,18 @@ def test_info_and_health(client: Client) -> None:
     assert client.health() == sdk.Health(status="ok", ready=True)
     assert "ply" in info.formats
     assert info.devices == ("cpu",)
+
+
+@pytest.mark.parametrize("transport", ["http", "grpc"])
+def test_info_holds_all_that_the_server_says_it_takes(server: RunningServer, transport: str) -> None:
+    said = httpx2.get(f"{server.url}/v1/info").json()
+    with Client(server.url if transport == "http" else server.grpc_url) as client:
+        info = asdict(client.info())
+    shown = said | {"devices": tuple(said["devices"]), "formats": tuple(each["name"] for each in said["formats"])}
+    assert info == shown
+    assert [(name, info[name]) for name in ("max_queued_points", "max_sync_seconds", "result_ttl_seconds")] == [
+        ("max_queued_points", 200_000_000), ("max_sync_seconds", 300.0), ("result_ttl_seconds", 3600.0),
+    ]  # fmt: skip
 
 
 def test_an_open3d_cloud_comes_back_as_one(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
