@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import urllib.request
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from tests.clouds import sphere
 from tests.conftest import RunningServer
 from tests.waiting import wait_for
 
@@ -92,16 +95,18 @@ def test_tabs_whose_jobs_wait_leave_connections_to_others_and_to_cancel(
     os.kill(worker, signal.SIGSTOP)
     try:
         url = f"{server.url}/jobs?iterations=1"
-        urllib.request.urlopen(urllib.request.Request(url, scan.read_bytes(), method="POST")).close()
+        np.savetxt(few := io.BytesIO(), sphere(100))  # soon done, once the worker goes on
+        urllib.request.urlopen(urllib.request.Request(url, few.getvalue(), method="POST")).close()
         wait_for(lambda: b'"queued"' not in urllib.request.urlopen(f"{server.url}/jobs").read())  # it has the worker
-        tabs = [page, *(page.context.new_page() for _ in range(others))]
-        for tab in tabs:
+        tabs: list[Any] = []
+        for _ in range(1 + others):
+            tabs.append(tab := page.context.new_page() if tabs else page)  # in front: one behind others draws rarely
             tab.goto(server.url)
             tab.select_option("#iterations", "1")
             tab.set_input_files("#file", scan)
             tab.click("#submit")
             tab.locator("#status", has_text="Waiting").wait_for()
-            if are_hidden and tab is not tabs[-1]:
+            if are_hidden and len(tabs) <= others:
                 tab.evaluate(HIDE, True)
         if are_hidden:
             with tabs[1].expect_request("**/events"):
