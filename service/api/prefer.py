@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 __all__ = ["Preference", "parse_prefer"]
+
+# What stands between commas, and of it a preference with its value, which parameters may follow (RFC 7240, 2). A comma
+# in quotes is none; where quotes do not end, the rest is in them. Nothing is tried twice: a header may be long.
+_ITEM = re.compile(r'(?:"(?:\\.|[^"\\])*+"?+|[^",]++)++')
+_PREFERENCE = re.compile(r'\s*+([^\s=;"]++)\s*+(?:=\s*+("(?:\\.|[^"\\])*+"|[^\s;"]*+)\s*+)?+(?:;|$)')
+_ESCAPED = re.compile(r"\\(.)")
 
 
 @dataclass(frozen=True)
@@ -29,13 +36,15 @@ class Preference:
 
 
 def parse_prefer(values: list[str]) -> Preference:
-    """Read every Prefer header of a request; what is unknown or malformed is ignored, as the RFC asks."""
-    respond_async, wait = False, None
-    for item in ",".join(values).split(","):
-        name, _, value = item.partition(";")[0].partition("=")
-        text = value.strip().strip('"')
-        if name.strip().lower() == "respond-async":
-            respond_async = True
-        elif name.strip().lower() == "wait" and text.isascii() and text.isdigit() and wait is None:
-            wait = float(text[:9])
-    return Preference(respond_async, wait)
+    """Read every Prefer header of a request; what is unknown or malformed is ignored, as the RFC asks.
+
+    So is respond-async with a value, which it has none of ("=false"), and all but the first of what is said twice.
+    """
+    said: dict[str, str] = {}
+    for item in (item for value in values for item in _ITEM.findall(value)):
+        if found := _PREFERENCE.match(item):
+            word = found[2] or ""
+            said.setdefault(found[1].lower(), _ESCAPED.sub(r"\1", word[1:-1]) if word.startswith('"') else word)
+    wait = said.get("wait", "")
+    is_wait = wait.isascii() and wait.isdigit()
+    return Preference(said.get("respond-async") == "", float(wait[:9]) if is_wait else None)

@@ -26,6 +26,30 @@ def test_only_what_was_heeded_is_said_to_be_applied(prefer: str, finished: bool,
 
 
 @pytest.mark.parametrize(
+    ("lines", "respond_async", "wait"),
+    [
+        (["respond-async=false"], False, None),  # it has no value
+        (["respond-async=true", "Respond-Async = 0"], False, None),
+        (["respond-async=, wait=5"], True, 5.0),  # an empty value is none
+        (['RESPOND-ASYNC = "" ; why=x, WAIT = "5"'], True, 5.0),
+        (["respond-async; wait=5"], True, None),  # a parameter is no preference
+        (["respond-async=false, respond-async", "wait=7, wait=8"], False, 7.0),  # the first one counts
+        (["wait=soon, wait=8", "wait=9"], False, None),
+        (['note="a, respond-async, wait=5, b", wait=6'], False, 6.0),  # commas in quotes
+        (['note="an \\", respond-async, \\"", wait=6'], False, 6.0),
+        (['note="open, respond-async', "wait=6"], False, 6.0),
+        (['wait="5;6"', "respond-async"], True, None),
+        (['wait="\\5"', "respond-async x", '"respond-async"', "=", ",,"], False, 5.0),
+        (["wait=-1", "wait=²"], False, None),
+        (["wait=5 6", "respond-async"], True, None),
+    ],
+)
+def test_a_preference_is_read_as_rfc_7240_has_it(lines: list[str], respond_async: bool, wait: float | None) -> None:
+    said = parse_prefer(lines)
+    assert (said.respond_async, said.wait) == (respond_async, wait)
+
+
+@pytest.mark.parametrize(
     ("header", "asked"),
     [
         ("text/event-stream", True), ("TEXT/Event-Stream; q=0.5, */*", True), ("*/*, text/event-stream;q=0", False),

@@ -20,6 +20,7 @@ from straightpcf.points.wire.patches import PATCHES_MEDIA_TYPE, PatchReader
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer, run_server
 from tests.service.rest import curl
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -206,6 +207,16 @@ def test_respond_async_with_a_wait_waits_first_and_what_was_heeded_is_said(http:
         for prefer in ("wait=60", "respond-async, wait=60"):
             done = http.post(f"/denoise?iterations=1{query}", content=SMALL, headers={"Prefer": prefer})
             assert (done.status_code, done.headers["preference-applied"]) == (200, "wait=60")
+
+
+def test_respond_async_with_a_value_is_no_preference_that_is_known(http: httpx2.Client) -> None:
+    for prefer in ("respond-async=false", "respond-async=true; x=1", "respond-async=0, respond-async"):
+        done = http.post("/denoise?iterations=1", content=SMALL, headers={"Prefer": prefer})
+        assert (done.status_code, done.headers.get("preference-applied")) == (200, None), prefer
+    wait_for(lambda: http.get("/jobs").json()["jobs"] == [])  # each lived as long as its request
+    answer = http.post("/denoise?iterations=10", content=LARGE, headers={"Prefer": 'respond-async=""; x=1'})
+    assert (answer.status_code, answer.headers["preference-applied"]) == (202, "respond-async")
+    assert http.delete(answer.headers["location"]).status_code == 204
 
 
 def test_denoise_tells_its_events_and_its_report_on_the_same_response(http: httpx2.Client) -> None:
