@@ -82,7 +82,8 @@ def _response(request: Request, asset: Asset) -> Response:
     is_packed = asks_for(",".join(request.headers.getlist("accept-encoding")), "gzip")
     # A packed body is another representation: it needs a tag of its own.
     headers = {**_HEADERS, "ETag": f'"{asset.etag}{"-gz" if is_packed else ""}"'}
-    if asset.etag in request.headers.get("if-none-match", ""):
+    had = ",".join(request.headers.getlist("if-none-match"))
+    if asset.etag in had or had.strip() == "*":  # whichever: RFC 9110, 13.1.2
         return Response(status_code=304, headers=headers)
     if is_packed:
         headers["Content-Encoding"] = "gzip"
