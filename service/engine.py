@@ -188,9 +188,8 @@ class Engine:
         # Raises before anything waits. "PLY" is "ply": what is kept is one spelling, by which a repeat is known, too.
         format = None if request.format is None else format_named(request.format).name
         _check_id(request.id)
-        content, weight = await asyncio.to_thread(
-            lambda: (digest_of(source), estimate_points(source, name=request.name or "the cloud"))
-        )
+        name = request.name or "the cloud"
+        content, weight = await asyncio.to_thread(lambda: (digest_of(source), estimate_points(source, name=name)))
         said = [request.endpoint, asdict(request.options), request.name, format, content]
         new = NewJob(
             id=request.id or uuid.uuid4().hex,
@@ -224,14 +223,15 @@ class Engine:
         self.limits.check_queue(load, weight=new.weight)
         self.limits.check_key(store.load(new.owner))
         self.limits.check_disk(load, self._folders.free_bytes(), spool=new.spool, written=new.bytes)
-        created = False
         try:
             self._folders.adopt(source, new.folder)
             record, created = store.create(new)
-        finally:
-            if not created:  # another server was quicker, or the disk is full
-                self._folders.remove(new.folder)
-        if created and known is not None:
+        except BaseException:  # of a full disk all this is tried again where there was room to be made
+            self._folders.give_back(new.folder, source)
+            raise
+        if not created:  # another server was quicker
+            self._folders.remove(new.folder)
+        elif known is not None:
             self._folders.remove(known.folder)
         return record, created
 

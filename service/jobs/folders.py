@@ -92,6 +92,12 @@ class JobFolders:
         for path in (folder, self._jobs):
             _sync(path)
 
+    def give_back(self, name: str, upload: Path) -> None:
+        """Undo `adopt`, as far as it came: what failed may be tried again."""
+        with suppress(OSError):  # what made it fail is raised already
+            (self.path(name) / INPUT).replace(upload)
+        self.remove(name)
+
     def remove(self, folder: str) -> None:
         """Remove a job's files."""
         shutil.rmtree(self.path(folder), ignore_errors=True)

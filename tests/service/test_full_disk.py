@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import resource
 import signal
+import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
@@ -21,8 +23,12 @@ from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends.base import FileJob
 from straightpcf.service.backends.worker import Failed, _answer
 from straightpcf.service.jobs.full_disk import RESERVE, RESERVE_BYTES
+from straightpcf.service.jobs.record import JobRecord, NewJob
+from straightpcf.service.jobs.store import JobStore
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer, run_server
+from tests.service.fakes import ObedientBackend
+from tests.service.in_process import serving
 from tests.waiting import wait_for
 
 DISK_BYTES = 2**21 + 2**18
@@ -126,6 +132,32 @@ def test_every_job_is_deleted_on_a_disk_that_stays_full(tmp_path: Path) -> None:
                     time.sleep(1)
                     assert http.delete(f"/jobs/{number}").status_code == 204, number
             assert not http.get("/jobs").json()["jobs"]
+
+
+def test_an_upload_that_finds_room_at_the_second_try_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The -wal is emptied where the disk is full, and then all is tried again: with the file, which had been moved."""
+    create, tries = JobStore.create, []
+
+    def full_at_first(store: JobStore, job: NewJob) -> tuple[JobRecord, bool]:
+        tries.append(job.folder)
+        if len(tries) == 1:
+            error = sqlite3.OperationalError("database or disk is full")
+            error.sqlite_errorcode = sqlite3.SQLITE_FULL
+            raise error
+        return create(store, job)
+
+    async def ask() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (_, host, port), httpx2.AsyncClient() as http:
+            job = f"http://{host}:{port}/jobs/a"
+            assert (await http.put(job, content=b"0 0 0\n")).status_code == 202
+            assert (await http.get(job)).json()["bytes"] == 6
+
+    monkeypatch.setattr(JobStore, "create", full_at_first)
+    asyncio.run(ask())
+    assert len(tries) == 2
+    assert tries[0] == tries[1]
+    assert (tmp_path / "jobs" / tries[0] / "input").read_bytes() == b"0 0 0\n"
+    assert not list((tmp_path / "incoming").iterdir())
 
 
 def test_a_server_starts_on_a_full_disk_and_makes_room_by_what_is_over_its_time(tmp_path: Path) -> None:
