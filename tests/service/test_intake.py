@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
 import time
 from pathlib import Path
+from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
 
 from straightpcf.service.api.disposition import disposition, disposition_name
+from straightpcf.service.jobs.record import JobRecord, NewJob
+from straightpcf.service.jobs.store import JobStore
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
+from tests.service.fakes import ObedientBackend
 from tests.service.in_process import serving
 from tests.service.rest import curl, raw
 from tests.service.test_races import CLOUD, play, willing
@@ -218,3 +223,30 @@ def test_a_result_whose_name_is_ascii_is_called_so_in_the_form_that_every_client
 def test_any_other_name_is_said_in_the_extended_form(name: str) -> None:
     assert disposition(name).startswith("attachment; filename*=utf-8''")
     assert disposition_name(disposition(name)) == name
+
+
+def test_a_file_and_its_name_are_on_the_disk_before_its_job_is_committed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a power cut leaves of an accepted job."""
+    sync, create = os.fsync, JobStore.create
+    happened: list[Any] = []
+
+    def watched_sync(handle: int) -> None:
+        sync(handle)
+        happened.append(Path(f"/proc/self/fd/{handle}").readlink())
+
+    def watched_create(store: JobStore, job: NewJob) -> tuple[JobRecord, bool]:
+        happened.append(job.folder)
+        return create(store, job)
+
+    async def ask() -> None:
+        async with serving(tmp_path, ObedientBackend()) as (_, host, port), httpx2.AsyncClient() as http:
+            assert (await http.put(f"http://{host}:{port}/jobs/a", content=b"0 0 0\n")).status_code == 202
+
+    monkeypatch.setattr(os, "fsync", watched_sync)
+    monkeypatch.setattr(JobStore, "create", watched_create)
+    asyncio.run(ask())
+    file, *folders, job = happened
+    assert file.parent == tmp_path / "incoming"
+    assert folders == [tmp_path / "jobs" / job, tmp_path / "jobs"]
