@@ -42,8 +42,8 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
 for module in (VelocityModule(128).eval(), DistanceModule(128).eval()):
     whole = FusedOnDevice(module.to(device).encoder, module.decoder, 32)
-    x = torch.randn(2, 40, 3, generator=generator).to(device) * 0.2
-    for rows in (None, 17)[: 2 if isinstance(module, VelocityModule) else 1]:
+    x = torch.randn(1, 34, 3, generator=generator).to(device) * 0.2
+    for rows in (None, 5)[: 2 if isinstance(module, VelocityModule) else 1]:
         with torch.no_grad():
             found, expected = whole(x, rows), module.decoder(module.encoder(x, rows))
         assert found.shape == expected.shape and found.dtype == torch.float32
