@@ -146,20 +146,15 @@ def edge_max_into(
     With bias, skip and half what `edge_conv` does is written, to out where there is activation.
     """
     (batch, rows, channels), out_channels = a.shape, weight.shape[0]
-    points_each, width, step, warps, stages = _tiling(channels, out_channels, a.device)
-    _edge_max[batch, triton.cdiv(rows, points_each), triton.cdiv(out_channels, width)](
+    width = min(256, triton.next_power_of_2(out_channels))
+    _edge_max[batch, triton.cdiv(rows, _EDGE_POINTS), triton.cdiv(out_channels, width)](
         a, b, index, weight, out, out if won is None else won, out if bias is None else bias,
         out if skip is None else skip, out if half is None else half, b.shape[1], rows, out_channels,
         a.stride(1), b.stride(1), 0 if half is None else half.stride(1),
-        CHANNELS=channels, STEP=step, K=index.shape[2], ROWS=points_each, WIDTH=width, WON=won is not None,
-        WHOLE=half is not None, ACTIVATION=activation, num_warps=warps, num_stages=stages,
+        CHANNELS=channels, STEP=min(64, channels & -channels), K=index.shape[2], ROWS=_EDGE_POINTS, WIDTH=width,
+        WON=won is not None, WHOLE=half is not None, ACTIVATION=activation,
+        num_warps=8, num_stages=3 if _room(a.device) >= _ROOM_FOR_THREE else 2,
     )  # fmt: skip
-
-
-def _tiling(channels: int, out_channels: int, device: torch.device) -> tuple[int, int, int, int, int]:
-    """Return of how many points a tile has the edges, how many of their sums, in what steps; warps, stages."""
-    width, step = min(256, triton.next_power_of_2(out_channels)), min(64, channels & -channels)
-    return _EDGE_POINTS, width, step, 8, 3 if _room(device) >= _ROOM_FOR_THREE else 2
 
 
 @functools.cache
