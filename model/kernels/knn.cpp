@@ -71,7 +71,39 @@ struct Candidates {
       : distance(padded + LANES), index(padded + LANES), chosen(padded + LANES), keys(padded) {}
 };
 
+#if defined(__AVX2__)
+
+// Which lanes of v are at most `limit`, as bits.
+inline uint32_t within(ivec v, int32_t limit) {
 #if defined(__AVX512F__)
+  return _mm512_cmple_epi32_mask((__m512i)v, _mm512_set1_epi32(limit));
+#else
+  return 0xff & ~uint32_t(_mm256_movemask_ps((__m256)(v > ivec{} + limit)));
+#endif
+}
+
+#if !defined(__AVX512F__)
+// Of each choice of eight lanes the chosen ones, in order: a byte names a lane.
+struct Choices {
+  uint64_t lanes[256] = {};
+  constexpr Choices() {
+    for (int choice = 0; choice < 256; ++choice)
+      for (int lane = 0, place = 0; lane < 8; ++lane)
+        if (choice >> lane & 1) lanes[choice] |= uint64_t(lane) << 8 * place++;
+  }
+};
+constexpr Choices CHOICES;
+#endif
+
+// The chosen lanes of v side by side to `to`, which has room for a whole vector.
+inline void keep(ivec v, uint32_t chosen, int32_t* to) {
+#if defined(__AVX512F__)
+  _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(chosen), (__m512i)v));
+#else
+  const __m256i lanes = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(int64_t(CHOICES.lanes[chosen])));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), _mm256_permutevar8x32_epi32((__m256i)v, lanes));
+#endif
+}
 
 // A threshold, as bits, that at least k of `vectors` vectors of floats reach and at most k + spare, where ties allow;
 // `reached` do. All are >= 0, where floats order as their bits do, and at least k are at most `high`. Guessed by
@@ -86,10 +118,8 @@ inline Threshold threshold(const float* values, int vectors, int k, int spare, T
       const float share = (k + 0.5f * (1 + spare) - low.reached) / float(high.reached - low.reached);
       guess = std::min(std::max(bits_of(from + (float_of(high.bits) - from) * share), low.bits + 1), high.bits - 1);
     }
-    const __m512i limit = _mm512_set1_epi32(guess);
     int found = 0;
-    for (int n = 0; n < vectors; ++n)
-      found += __builtin_popcount(_mm512_cmple_epi32_mask(_mm512_loadu_si512(values + n * LANES), limit));
+    for (int n = 0; n < vectors; ++n) found += __builtin_popcount(within((ivec)load(values + n * LANES), guess));
     (found >= k ? high : low) = {guess, found};
   }
   return high;
@@ -98,38 +128,39 @@ inline Threshold threshold(const float* values, int vectors, int k, int spare, T
 // Indices of the k smallest distances (ties go to the lower index), in no particular order; of none that is a number: 0.
 // The k-th smallest of 64 disjoint groups' minima bounds the k-th smallest of all, so one pass leaves few candidates.
 inline void select(const float* distance, int padded, int k, Candidates& near, int32_t* out) {
-  int32_t bound = bits_of(FAR);
+  int32_t bound = bits_of(FAR) - 1;
   if (k <= GROUPS) {
     float least[GROUPS];
-    __m512 most = _mm512_setzero_ps();
+    vec most = {};
     for (int g = 0; g < GROUPS; g += LANES) {
-      __m512 m = _mm512_set1_ps(FAR);
-      for (int j = g; j < padded; j += GROUPS) m = _mm512_min_ps(_mm512_loadu_ps(distance + j), m);  // m of NaN and m
-      m = _mm512_max_ps(m, _mm512_setzero_ps());  // rounding may leave less than nothing, which orders the other way
-      _mm512_storeu_ps(least + g, m);
-      most = _mm512_max_ps(most, m);
+      vec m = splat(FAR);
+      for (int j = g; j < padded; j += GROUPS) {
+        const vec d = load(distance + j);
+        m = d < m ? d : m;  // m, where d is no number
+      }
+      m = m > 0 ? m : vec{};  // rounding may leave less than nothing, which orders the other way
+      store(least + g, m);
+      most = m > most ? m : most;
     }
-    bound = threshold(least, GROUPS / LANES, k, 3, {bits_of(_mm512_reduce_max_ps(most)), GROUPS}).bits;
+    const Threshold all{bits_of(largest_lane(most)), GROUPS};
+    bound = std::min(bound, threshold(least, GROUPS / LANES, k, 3, all).bits);
   }
-  const __m512i limit = _mm512_set1_epi32(bound), far = _mm512_castps_si512(_mm512_set1_ps(FAR));
-  const __m512i step = _mm512_set1_epi32(LANES);
-  __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  ivec index;
+  for (int lane = 0; lane < LANES; ++lane) index[lane] = lane;
   int count = 0;
-  for (int j = 0; j < padded; j += LANES, index = _mm512_add_epi32(index, step)) {
-    const __m512i d = _mm512_loadu_si512(distance + j);
-    const __mmask16 chosen = _mm512_cmple_epi32_mask(d, limit) & _mm512_cmplt_epi32_mask(d, far);
-    _mm512_storeu_si512(&near.index[count], _mm512_maskz_compress_epi32(chosen, index));
+  for (int j = 0; j < padded; j += LANES, index += LANES) {
+    const uint32_t chosen = within((ivec)load(distance + j), bound);
+    keep(index, chosen, &near.index[count]);
     count += __builtin_popcount(chosen);
   }
   if (count == 0) {  // NaN, which then comes of them whatever the neighbours
     std::fill(out, out + k, 0);
     return;
   }
-  const int vectors = (count + LANES - 1) / LANES;
-  for (int n = 0; n < vectors; ++n)
-    _mm512_storeu_ps(&near.distance[n * LANES],
-                     _mm512_max_ps(_mm512_i32gather_ps(_mm512_loadu_si512(&near.index[n * LANES]), distance, 4),
-                                   _mm512_setzero_ps()));
+  for (int n = 0; n < count; ++n) {
+    const float d = distance[near.index[n]];
+    near.distance[n] = d > 0 ? d : 0;
+  }
   if (count <= k) {  // fewer points than neighbours: in order, then the farthest again
     for (int n = 0; n < count; ++n)
       near.keys[n] = (uint64_t(bits_of(near.distance[n])) << 32) | uint32_t(near.index[n]);
@@ -137,15 +168,15 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
     for (int n = 0; n < k; ++n) out[n] = int32_t(uint32_t(near.keys[std::min(n, count - 1)]));
     return;
   }
-  _mm512_storeu_si512(&near.distance[count], far);
+  store(&near.distance[count], splat(FAR));
+  const int vectors = (count + LANES - 1) / LANES;
   const Threshold last = threshold(near.distance.data(), vectors, k, 0, {bound, count});
   const int32_t sure = last.reached == k ? last.bits : last.bits - 1;  // else some lie exactly there, and not all fit
-  const __m512i within = _mm512_set1_epi32(sure);
   int taken = 0;
   for (int n = 0; n < vectors; ++n) {
-    const __mmask16 chosen = _mm512_cmple_epi32_mask(_mm512_loadu_si512(&near.distance[n * LANES]), within);
-    const __m512i index = _mm512_loadu_si512(&near.index[n * LANES]);
-    _mm512_storeu_si512(&near.chosen[taken], _mm512_maskz_compress_epi32(chosen, index));
+    const uint32_t chosen = within((ivec)load(&near.distance[n * LANES]), sure);
+    std::memcpy(&index, &near.index[n * LANES], sizeof index);
+    keep(index, chosen, &near.chosen[taken]);
     taken += __builtin_popcount(chosen);
   }
   for (int n = 0; taken < k; ++n)

@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <cstring>
 #include <vector>
-#if defined(__AVX512F__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
@@ -33,6 +33,13 @@ inline void store(float* p, vec v) { *reinterpret_cast<vec*>(p) = v; }
 template <typename T>
 inline T* aligned(T* p) { return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(p) + 63) / 64 * 64); }  // to a line
 inline vec splat(float x) { return vec{} + x; }
+inline float largest_lane(vec v) {
+  float lanes[LANES];
+  store(lanes, v);
+  for (int half = LANES / 2; half; half /= 2)
+    for (int n = 0; n < half; ++n) lanes[n] = std::max(lanes[n], lanes[n + half]);
+  return lanes[0];
+}
 
 inline int32_t bits_of(float x) { int32_t bits; std::memcpy(&bits, &x, 4); return bits; }
 inline float float_of(int32_t bits) { float x; std::memcpy(&x, &bits, 4); return x; }
