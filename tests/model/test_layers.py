@@ -139,6 +139,7 @@ def test_points_stay_in_their_layers() -> None:
     assert not np.array_equal(within, layers.anywhere_within(4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step", "noise"), [(0.006, 0.0), (0.01, 0.3)])
 def test_what_a_depth_camera_sees_comes_nearer_to_it(step: float, noise: float) -> None:
     _, told = seen(step, noise=noise, side=100)
@@ -148,6 +149,7 @@ def test_what_a_depth_camera_sees_comes_nearer_to_it(step: float, noise: float) 
     assert any("layers along z" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_narrow_layers_are_filtered_as_they_are_and_often_enough() -> None:
     told = in_layers(torus(8000), 0.016)
     result = load_filter(threads=2).denoise(told)

@@ -100,6 +100,7 @@ def test_official_weights_are_the_plain_formula(reference: ModuleType, monkeypat
     assert share_that_differs(official()(patch), reference.velocity(state, patch)) < 1e-4
 
 
+@pytest.mark.slow
 @needs_data
 def test_official_weights_give_the_authors_figures_on_cow(reference: ModuleType) -> None:
     cd, p2m = measured(reference, "cow")

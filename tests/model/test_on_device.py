@@ -64,6 +64,7 @@ def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) ->
     np.testing.assert_allclose(result.distances, expected.distances, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_cloud_in_tiles_is_spread_too(network: StraightPCF) -> None:
     cloud = noisy(torus(11_000), 0.01)
     options = DenoiseOptions(iterations=2)

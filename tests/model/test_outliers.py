@@ -79,6 +79,7 @@ def test_many_points_in_the_air_are_found_as_few_are(share: float, noise_std: fl
     assert apart[10_000:][away].mean() > 0.95
 
 
+@pytest.mark.slow
 def test_many_points_in_the_air_change_little_for_the_others(
     shipped: Filter, filtered_alone: Callable[[float], tuple[np.ndarray, DenoiseResult]]
 ) -> None:

@@ -168,6 +168,7 @@ def test_what_is_noisy_is_filtered_beside_a_floor_without_noise() -> None:
     assert np.sqrt(np.mean(run.result(0.0).xyz[12_000:14_500, 1] ** 2)) < 0.8 * 0.05
 
 
+@pytest.mark.slow
 def test_a_scenes_noise_beyond_the_table_is_read_and_taken_away() -> None:
     cloud = np.concatenate([noisy(torus(9000), 0.07), far_group(300.0)])
     run = Run(load_filter(device="cpu"), cloud, DenoiseOptions(iterations=2))

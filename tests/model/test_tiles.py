@@ -109,6 +109,7 @@ def test_a_halo_that_would_be_the_whole_cloud_is_held_to_the_size_of_its_tile() 
         assert len(np.unique(cut.index)) <= 2 * len(tile)
 
 
+@pytest.mark.slow
 def test_no_seam_is_to_be_seen() -> None:
     clean = torus(20_000)
     xyz = noisy(clean, 0.01)

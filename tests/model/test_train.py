@@ -177,6 +177,7 @@ def test_an_interrupted_run_ends_with_the_weights_of_an_uninterrupted_one(data: 
     assert same(weights(once / "state.safetensors"), weights(twice / "state.safetensors"))
 
 
+@pytest.mark.slow
 def test_a_shared_run_is_the_same_again_and_where_it_was_interrupted(data: Path, tmp_path: Path) -> None:
     def run(name: str, stops: Sequence[bool] = ()) -> dict[str, torch.Tensor]:
         asked = iter([*stops, *6 * [False]])

@@ -16,11 +16,8 @@ pytest.importorskip("triton", reason="Triton is not installed: pip install trito
 _COMPARE = """
 import torch
 from straightpcf.model import device_patches, ops
-from straightpcf.model.kernels import cuda, cuda_gradient
-from straightpcf.model.kernels.fused_cuda import FusedOnDevice
-from straightpcf.model.nets.straightpcf import DistanceModule, VelocityModule
+from straightpcf.model.kernels import cuda
 
-torch.manual_seed(0)
 device = "cuda" if torch.cuda.is_available() else "cpu"
 generator = torch.Generator().manual_seed(0)
 for points, channels, k, rows in ((200, 3, 32, 7), (200, 3, 16, 5), (130, 32, 32, 5), (333, 64, 32, 3),
@@ -40,6 +37,22 @@ for channels, out in ((16, 16), (32, 32), (64, 64), (128, 128), (256, 256)):
     index = ops.knn_torch(b, 32, 22)
     found, expected = cuda.edge_max(a[:, :22], b, index.int(), weight), ops.edge_max_torch(a[:, :22], b, index, weight)
     assert (found - expected).norm() / expected.norm() < 2e-3, (channels, out)
+cloud = torch.randn(9000, 3, generator=generator).to(device)
+for wanted, first in ((1, 0), (8, 1), (8, 8999)):
+    assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
+print("same")
+"""
+
+# A module as one, and what each machine with a GPU asks of the kernels before it takes them.
+_COMPARE_MODULES = """
+import torch
+from straightpcf.model.kernels import cuda, cuda_gradient
+from straightpcf.model.kernels.fused_cuda import FusedOnDevice
+from straightpcf.model.nets.straightpcf import DistanceModule, VelocityModule
+
+torch.manual_seed(0)
+device = "cuda" if torch.cuda.is_available() else "cpu"
+generator = torch.Generator().manual_seed(0)
 for module in (VelocityModule(128).eval(), DistanceModule(128).eval()):
     whole = FusedOnDevice(module.to(device).encoder, module.decoder, 32)
     x = torch.randn(1, 34, 3, generator=generator).to(device) * 0.2
@@ -50,9 +63,6 @@ for module in (VelocityModule(128).eval(), DistanceModule(128).eval()):
         assert (found - expected).norm() / expected.norm() < 3e-2, (type(module), rows)
 for prove in (cuda._prove, cuda_gradient._prove_gradient):
     prove(torch.device(device), 1000 if device == "cuda" else 34)
-cloud = torch.randn(9000, 3, generator=generator).to(device)
-for wanted, first in ((1, 0), (8, 1), (8, 8999)):
-    assert torch.equal(cuda.farthest(cloud, wanted, first), device_patches.farthest_torch(cloud, wanted, first))
 print("same")
 """
 
@@ -114,11 +124,15 @@ def ran(script: str, tmp_path: Path, **environment: str) -> str:
     return done.stdout + done.stderr
 
 
-def test_the_kernels_are_their_torch_twins(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "script", [_COMPARE, pytest.param(_COMPARE_MODULES, marks=pytest.mark.slow)], ids=["each", "modules"]
+)
+def test_the_kernels_are_their_torch_twins(script: str, tmp_path: Path) -> None:
     interpreted = {} if torch.cuda.is_available() else {"TRITON_INTERPRET": "1"}
-    assert ran(_COMPARE, tmp_path, **interpreted) == "same\n"
+    assert ran(script, tmp_path, **interpreted) == "same\n"
 
 
+@pytest.mark.slow
 def test_the_kernels_compile_for_hopper_and_fit_it(tmp_path: Path) -> None:
     # The interpreter runs what the compiler refuses: once none of these kernels compiled, and all agreed.
     assert ran(_COMPILE, tmp_path, TRITON_CACHE_DIR=str(tmp_path / "cache")) == "compiled\n"
