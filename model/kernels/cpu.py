@@ -45,7 +45,7 @@ _ARM = {"asimddp": "-march=armv8.2-a+dotprod", "generic": ""}
 _REORDER = "-fassociative-math -fno-signed-zeros -fno-trapping-math -fno-math-errno -freciprocal-math"
 _FLAGS = f"-O3 -std=c++17 -fPIC -shared {_REORDER} -Wno-psabi"
 _BUILD_SECONDS = 120
-Packing = Literal["edge_max", "edge_max_coarse", "linear"]  # the kernel that a weight is packed for
+Packing = Literal["edge_max", "edge_max_fine", "edge_max_coarse", "linear"]  # the kernel that a weight is packed for
 
 
 @functools.cache
@@ -164,7 +164,8 @@ def _open_whole(path: Path) -> ctypes.CDLL:
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in ("knn", "pack", "edge_max", "edge_max_backward", "fused", "pack_coarse", "pack_linear"):
+    packing = "pack", "pack_fine", "pack_coarse", "pack_linear"
+    for name in ("knn", "edge_max", "edge_max_backward", "fused", *packing):
         try:
             getattr(library, f"straightpcf_{name}").restype = None
         except AttributeError as exc:
@@ -189,12 +190,13 @@ def knn(library: ctypes.CDLL, x: torch.Tensor, k: int, rows: int) -> torch.Tenso
 def packed(library: ctypes.CDLL, weight: torch.Tensor, kernel: Packing) -> torch.Tensor:
     """Return a weight (D, C) float32 as a kernel reads it.
 
-    kernel: "edge_max", D a multiple of 16 and C even; "edge_max_coarse" or "linear", both multiples of 32.
+    kernel: "edge_max", D a multiple of 16 and C even; of the others both are multiples of 32.
     """
     weight = weight.contiguous()
     out = torch.empty_like(weight)
     pack = {
         "edge_max": library.straightpcf_pack,
+        "edge_max_fine": library.straightpcf_pack_fine,
         "edge_max_coarse": library.straightpcf_pack_coarse,
         "linear": library.straightpcf_pack_linear,
     }[kernel]

@@ -1,8 +1,8 @@
-// The EdgeConv maximum in products of small integers with 32-bit sums. For inference, and for block 3 alone: no graph of
-// neighbours is taken from its output. What ReLU leaves of an edge is rounded to steps, so many up to that edge's
-// largest, and a row of the weight likewise. Of bytes (VNNI, or ARM's dot product) an instruction makes four times as
-// many products as of float32; of 16 bits, which every x86 has, twice as many. On AMX's tiles, in AVX-512 without VNNI,
-// where 16 bits gain nothing, and on other processors it is straightpcf_edge_max.
+// The EdgeConv maximum in products of 8-bit integers with 32-bit sums (VNNI, or ARM's dot product): twice as many in an
+// instruction as of bfloat16, four times as many as of float32. For inference, and for block 3 alone: no graph of
+// neighbours is taken from its output. What ReLU leaves of an edge is rounded to steps, 255 up to that edge's largest,
+// and a row of the weight to 127 up to its largest. Where there is no such instruction, and on AMX's tiles, it is
+// straightpcf_edge_max_fine.
 
 #include "kernels.h"
 #include "vectors.h"
@@ -11,25 +11,18 @@
 #include <arm_neon.h>
 #endif
 
-#if defined(__AVX512VNNI__) || defined(__ARM_FEATURE_DOTPROD) || (defined(__SSE2__) && !defined(__AVX512F__))
+#if defined(__AVX512VNNI__) || defined(__AVXVNNI__) || defined(__ARM_FEATURE_DOTPROD)
 
 #include <cmath>
 
 namespace {
 
-// An edge's numbers go from -ZERO to LARGEST_EDGE - ZERO. ARM's bytes have a sign on both sides, so that an edge's zero
-// lies there. A row of the weight goes up to LARGEST_WEIGHT, and its sum so far that no sum of products is over 32 bits.
-#if defined(__AVX512VNNI__) || defined(__AVXVNNI__) || defined(__ARM_FEATURE_DOTPROD)
-typedef int8_t integer;
+constexpr int PER_LANE = 4;  // products that a lane sums in one instruction
 constexpr float LARGEST_EDGE = 255.0f, LARGEST_WEIGHT = 127.0f;
-#else
-typedef int16_t integer;
-constexpr float LARGEST_EDGE = 8191.0f, LARGEST_WEIGHT = 32767.0f;
-#endif
-constexpr int PER_LANE = sizeof(int32_t) / sizeof(integer);  // products that a lane sums in one instruction
-typedef integer integers __attribute__((vector_size(LANES * sizeof(integer)), aligned(1), may_alias));
+typedef int8_t bytes __attribute__((vector_size(LANES), aligned(1), may_alias));
 
-// sum + edge times weight, PER_LANE products to a lane.
+// sum + edge (bytes from -ZERO to 255 - ZERO) times weight (bytes from -127 to 127), four to a lane. ARM's bytes have
+// a sign on both sides, so that an edge's zero lies there.
 #if defined(__AVX512VNNI__)
 constexpr int ZERO = 0;
 inline ivec add_products(ivec sum, ivec edge, ivec weight) {
@@ -39,16 +32,6 @@ inline ivec add_products(ivec sum, ivec edge, ivec weight) {
 constexpr int ZERO = 0;
 inline ivec add_products(ivec sum, ivec edge, ivec weight) {
   return (ivec)_mm256_dpbusd_avx_epi32((__m256i)sum, (__m256i)edge, (__m256i)weight);
-}
-#elif defined(__AVX2__)
-constexpr int ZERO = 0;
-inline ivec add_products(ivec sum, ivec edge, ivec weight) {
-  return sum + (ivec)_mm256_madd_epi16((__m256i)edge, (__m256i)weight);
-}
-#elif defined(__SSE2__)
-constexpr int ZERO = 0;
-inline ivec add_products(ivec sum, ivec edge, ivec weight) {
-  return sum + (ivec)_mm_madd_epi16((__m128i)edge, (__m128i)weight);
 }
 #else
 constexpr int ZERO = 128;
@@ -61,7 +44,7 @@ inline ivec load(const int32_t* p) { return *reinterpret_cast<const ivec*>(p); }
 
 // relu(a_i + b_j) for the edges of one point, and how large a step of each is. `row` has room for one edge.
 inline void hidden_rows(const float* a, const float* b, const int32_t* index, int k, int width, float* row,
-                        integer* out, float* steps) {
+                        int8_t* out, float* steps) {
   for (int n = 0; n < k; ++n) {
     const float* other = b + (size_t)index[n] * width;
     vec most = {};
@@ -73,17 +56,17 @@ inline void hidden_rows(const float* a, const float* b, const int32_t* index, in
     const float largest = largest_lane(most);
     steps[n] = largest / LARGEST_EDGE;
     const float scale = largest > 0 ? LARGEST_EDGE / largest : 0;
-    integer* place = out + (size_t)n * width;
+    int8_t* place = out + (size_t)n * width;
     for (int d = 0; d < width; d += LANES) {
       const ivec whole = __builtin_convertvector(load(row + d) * scale + 0.5f, ivec);
-      *reinterpret_cast<integers*>(place + d) = __builtin_convertvector(whole - ZERO, integers);
+      *reinterpret_cast<bytes*>(place + d) = __builtin_convertvector(whole - ZERO, bytes);
     }
   }
 }
 
 // One block of R edges by C vectors of channels: products with the packed weight, then the running maximum.
 template <int R, int C>
-inline void block(const integer* hidden, const float* steps, int width, const integer* packed, const int32_t* start,
+inline void block(const int8_t* hidden, const float* steps, int width, const int8_t* packed, const int32_t* start,
                   vec* best) {
   ivec s[R][C];
   for (int r = 0; r < R; ++r)
@@ -93,9 +76,9 @@ inline void block(const integer* hidden, const float* steps, int width, const in
     for (int c = 0; c < C; ++c)
       w[c] = load(reinterpret_cast<const int32_t*>(packed + (size_t)c * LANES * width + (size_t)d * LANES));
     for (int r = 0; r < R; ++r) {
-      int32_t some;
-      std::memcpy(&some, hidden + (size_t)r * width + d, sizeof some);
-      for (int c = 0; c < C; ++c) s[r][c] = add_products(s[r][c], ivec{} + some, w[c]);
+      int32_t four;
+      std::memcpy(&four, hidden + (size_t)r * width + d, PER_LANE);
+      for (int c = 0; c < C; ++c) s[r][c] = add_products(s[r][c], ivec{} + four, w[c]);
     }
   }
   for (int r = 0; r < R; ++r)
@@ -105,14 +88,14 @@ inline void block(const integer* hidden, const float* steps, int width, const in
     }
 }
 
-// The parts of a packed weight: integers, how large a step of each row is, and ZERO times each row's sum.
+// The parts of a packed weight: bytes, how large a step of each row is, and ZERO times each row's sum.
 struct Packed {
-  integer* whole;
+  int8_t* bytes;
   float* steps;
   int32_t* starts;
   Packed(const float* packed, int width, int out_width) {
-    whole = reinterpret_cast<integer*>(const_cast<float*>(packed));
-    steps = reinterpret_cast<float*>(whole + (size_t)width * out_width);
+    bytes = reinterpret_cast<int8_t*>(const_cast<float*>(packed));
+    steps = reinterpret_cast<float*>(bytes + (size_t)width * out_width);
     starts = reinterpret_cast<int32_t*>(steps + out_width);
   }
 };
@@ -126,40 +109,35 @@ void straightpcf_pack_coarse(const float* weight, int width, int out_width, floa
   const Packed to(packed, width, out_width);
   for (int c = 0; c < out_width; ++c) {
     const float* row = weight + (size_t)c * width;
-    float largest = 0, all = 0;
-    for (int d = 0; d < width; ++d) {
-      largest = std::max(largest, std::fabs(row[d]));
-      all += std::fabs(row[d]);
-    }
-    // Half a step of each number is left for rounding.
-    const float most = (float(INT32_MAX) / LARGEST_EDGE - 0.5f * width) * (1 - 1e-5f);
-    const float step = std::max(largest / LARGEST_WEIGHT, all / most), scale = step > 0 ? 1 / step : 0;
-    integer* column = to.whole + (size_t)(c / LANES) * LANES * width + (c % LANES) * PER_LANE;
+    float largest = 0;
+    for (int d = 0; d < width; ++d) largest = std::max(largest, std::fabs(row[d]));
+    const float scale = largest > 0 ? LARGEST_WEIGHT / largest : 0;
+    int8_t* column = to.bytes + (size_t)(c / LANES) * LANES * width + (c % LANES) * PER_LANE;
     int32_t sum = 0;
     for (int d = 0; d < width; ++d) {
       const int whole = int(std::nearbyint(row[d] * scale));
-      column[(size_t)(d / PER_LANE) * LANES * PER_LANE + d % PER_LANE] = integer(whole);
+      column[(size_t)(d / PER_LANE) * LANES * PER_LANE + d % PER_LANE] = int8_t(whole);
       sum += whole;
     }
-    to.steps[c] = step;
+    to.steps[c] = largest / LARGEST_WEIGHT;
     to.starts[c] = ZERO * sum;
   }
 }
 
-// As straightpcf_edge_max, without the winning edges.
+// As straightpcf_edge_max_fine.
 void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
-                                 int k, int width, int out_width, float* out) {
-  std::vector<float> scratch((size_t)width * (k / PER_LANE + 2) + k + 32);
+                                 int, int k, int width, int out_width, float* out) {
+  std::vector<float> scratch((size_t)width * (k / sizeof(float) + 2) + k + 16);
   float* row = aligned(scratch.data());
   float* steps = row + width;
-  integer* hidden = reinterpret_cast<integer*>(aligned(steps + k));
+  int8_t* hidden = reinterpret_cast<int8_t*>(aligned(steps + k));
   const Packed weight(packed, width, out_width);
   for (int i = 0; i < rows; ++i) {
     hidden_rows(a + (size_t)i * width, b, index + (size_t)i * k, k, width, row, hidden, steps);
     for (int c0 = 0; c0 < out_width; c0 += COLS * LANES) {
       vec best[COLS];
       for (int c = 0; c < COLS; ++c) best[c] = splat(-3.4e38f);
-      const integer* w = weight.whole + (size_t)c0 * width;
+      const int8_t* w = weight.bytes + (size_t)c0 * width;
       const int32_t* start = weight.starts + c0;
       int n = 0;
       for (; n + ROWS <= k; n += ROWS)
@@ -178,12 +156,12 @@ void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* 
 extern "C" {
 
 void straightpcf_pack_coarse(const float* weight, int width, int out_width, float* packed) {
-  straightpcf_pack(weight, width, out_width, packed);
+  straightpcf_pack_fine(weight, width, out_width, packed);
 }
 
 void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
-                                 int k, int width, int out_width, float* out) {
-  straightpcf_edge_max(a, b, index, packed, rows, k, width, out_width, out, nullptr);
+                                 int count, int k, int width, int out_width, float* out) {
+  straightpcf_edge_max_fine(a, b, index, packed, rows, count, k, width, out_width, out);
 }
 
 }  // extern "C"

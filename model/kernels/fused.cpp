@@ -65,9 +65,9 @@ void edge_conv(const float* x, int count, int stride, int width, const float* fe
   layer(x, stride, w.own, w.own_bias, rows, width, out_width, a);
   layer(x, stride, w.other, w.other_bias, count, width, out_width, b);
   if (last)
-    straightpcf_edge_max_coarse(a, b, index, w.second, rows, k, out_width, out_width, edges);
+    straightpcf_edge_max_coarse(a, b, index, w.second, rows, count, k, out_width, out_width, edges);
   else
-    straightpcf_edge_max(a, b, index, w.second, rows, k, out_width, out_width, edges, nullptr);
+    straightpcf_edge_max_fine(a, b, index, w.second, rows, count, k, out_width, out_width, edges);
   layer(x, stride, w.lin, w.lin_bias, rows, width, out_width, a);
   const vec least = splat(last ? -3.4e38f : 0.0f);
   for (int i = 0; i < rows; ++i)

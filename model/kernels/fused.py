@@ -36,7 +36,7 @@ class Fused:
         first, second, _ = outs = [block.lin.out_features for block in blocks]
         # Block 3 sees the first two blocks' features side by side, each filled up by itself.
         ins = [[3], [first], [first, second]]
-        maxima: list[cpu.Packing] = ["edge_max", "edge_max", "edge_max_coarse"]
+        maxima: list[cpu.Packing] = ["edge_max_fine", "edge_max_fine", "edge_max_coarse"]
         self._kept = [each for args in zip(blocks, ins, maxima, strict=True) for each in self._block(*args)]
         self._kept += self._decoder(decoder)
         self._layers = (ctypes.c_void_p * len(self._kept))(*(each.data_ptr() for each in self._kept))

@@ -9,9 +9,12 @@ void straightpcf_knn(const float* points, int count, int dims, int rows, int k, 
 void straightpcf_pack(const float* weight, int width, int out_width, float* packed);
 void straightpcf_edge_max(const float* a, const float* b, const int32_t* index, const float* packed, int rows, int k,
                           int width, int out_width, float* out, uint8_t* arg);
+void straightpcf_pack_fine(const float* weight, int width, int out_width, float* packed);
+void straightpcf_edge_max_fine(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
+                               int count, int k, int width, int out_width, float* out);
 void straightpcf_pack_coarse(const float* weight, int width, int out_width, float* packed);
 void straightpcf_edge_max_coarse(const float* a, const float* b, const int32_t* index, const float* packed, int rows,
-                                 int k, int width, int out_width, float* out);
+                                 int count, int k, int width, int out_width, float* out);
 void straightpcf_linear(const float* x, int stride, const float* packed, const float* bias, int rows, int width,
                         int out_width, int relu, float* out);
 

@@ -54,6 +54,7 @@ int main(int, char** arguments) {
   straightpcf_edge_max(a.data(), b.data(), index.data(), packed.data(), count, k, width, width, found.data(), nullptr);
   std::printf("%.2e ", error(found, expected));
   straightpcf_pack_coarse(weight.data(), width, width, packed.data());
-  straightpcf_edge_max_coarse(a.data(), b.data(), index.data(), packed.data(), count, k, width, width, found.data());
+  straightpcf_edge_max_coarse(a.data(), b.data(), index.data(), packed.data(), count, count, k, width, width,
+                              found.data());
   std::printf("%.2e\n", error(found, expected));
 }
