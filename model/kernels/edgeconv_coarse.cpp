@@ -40,8 +40,6 @@ inline ivec add_products(ivec sum, ivec edge, ivec weight) {
 }
 #endif
 
-inline ivec load(const int32_t* p) { return *reinterpret_cast<const ivec*>(p); }
-
 // relu(a_i + b_j) for the edges of one point, and how large a step of each is. `row` has room for one edge.
 inline void hidden_rows(const float* a, const float* b, const int32_t* index, int k, int width, float* row,
                         int8_t* out, float* steps) {

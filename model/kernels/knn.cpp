@@ -175,8 +175,7 @@ inline void select(const float* distance, int padded, int k, Candidates& near, i
   int taken = 0;
   for (int n = 0; n < vectors; ++n) {
     const uint32_t chosen = within((ivec)load(&near.distance[n * LANES]), sure);
-    std::memcpy(&index, &near.index[n * LANES], sizeof index);
-    keep(index, chosen, &near.chosen[taken]);
+    keep(load(&near.index[n * LANES]), chosen, &near.chosen[taken]);
     taken += __builtin_popcount(chosen);
   }
   for (int n = 0; taken < k; ++n)

@@ -29,6 +29,7 @@ struct alignas(4 * LANES) Line { vec v; };  // never across two cache lines
 
 // Not by memcpy, which gcc makes two halves of for AVX2, by way of the stack: five times as slow.
 inline vec load(const float* p) { return *reinterpret_cast<const vec*>(p); }
+inline ivec load(const int32_t* p) { return *reinterpret_cast<const ivec*>(p); }
 inline void store(float* p, vec v) { *reinterpret_cast<vec*>(p) = v; }
 template <typename T>
 inline T* aligned(T* p) { return reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(p) + 63) / 64 * 64); }  // to a line

@@ -236,6 +236,7 @@ def test_the_kernels_of_every_instruction_set_agree(monkeypatch: pytest.MonkeyPa
     index = ops.knn_torch(b, 20, 100)
     neighbours = index.sort().values
     expected = ops.edge_max_torch(a, b, index, weight)
+    torch.manual_seed(0)  # of another network a neighbour may be another
     module = VelocityModule().eval()
     monkeypatch.setattr(cpu, "load", lambda: None)
     with torch.no_grad():
@@ -246,7 +247,7 @@ def test_the_kernels_of_every_instruction_set_agree(monkeypatch: pytest.MonkeyPa
         assert (ops.knn(b, 20).sort().values == neighbours).float().mean() > 0.999, name
         error = 5e-3 if "bf16" in name else 1e-6
         assert float((ops.edge_max(a, b, index, weight) - expected).norm() / expected.norm()) < error, name
-        error = 2e-2 if "bf16" in name or "vnni" in name else 4e-6 if name == "avx512bw" else 1e-3
+        error = 2e-2 if "bf16" in name or "vnni" in name else 4e-6 if name == "avx512bw" else 1e-4
         with torch.no_grad():
             assert float((module(b[:, :, :3]) - velocities).norm() / velocities.norm()) < error, name
 
