@@ -62,16 +62,16 @@ inline void largest_of(const float* x, int rows, int width, float* most) {
   }
 }
 
-// How large a step is: no share and no edge has more of them than it may. What is farther below zero than 16
+// How many steps there are to 1: no share and no edge has more of them than it may. What is farther below zero than 16
 // bits reach is cut off there, and with no other share is above it.
-inline float step_of(const float* a, int rows, const float* b, int count, int width) {
+inline float scale_of(const float* a, int rows, const float* b, int count, int width) {
   std::vector<float> own(width), others(width);
   largest_of(a, rows, width, own.data());
   largest_of(b, count, width, others.data());
   float step = 0;
   for (int d = 0; d < width; ++d)  // two roundings make one step more
     step = std::max({step, std::max(own[d], others[d]) / LARGEST, (own[d] + others[d]) / (LARGEST_EDGE - 1)});
-  return step;
+  return step > 0 ? 1 / step : 0;
 }
 
 // One block of R edges by C vectors of channels: products with the packed weight, then the running maximum.
@@ -124,7 +124,7 @@ void straightpcf_edge_max_fine(const float* a, const float* b, const int32_t* in
                                int count, int k, int width, int out_width, float* out) {
   std::vector<int16_t> scratch((size_t)(count + k + 1) * width + 32);  // a cache line more, to begin at one
   int16_t *others = aligned(scratch.data()), *edges = others + (size_t)count * width, *own = edges + (size_t)k * width;
-  const float step = step_of(a, rows, b, count, width), scale = step > 0 ? 1 / step : 0;
+  const float scale = scale_of(a, rows, b, count, width), step = scale > 0 ? 1 / scale : 0;
   const int16_t* whole = reinterpret_cast<const int16_t*>(packed);
   const float* steps = reinterpret_cast<const float*>(whole + (size_t)width * out_width);
   round_rows(b, count, width, scale, others);
