@@ -12,13 +12,17 @@ from straightpcf.model.patches import PATCH_SIZE
 
 Floats = npt.NDArray[np.float64]
 
-__all__ = ["FAR_OUT", "NEIGHBOURS", "far_out", "isolated"]
+__all__ = ["FAR_OUT", "NEIGHBOURS", "far_out", "isolated", "without_data"]
 
 # A row so many times as far out as half of the rows are is a file's sign for "no data". With it, float64 would hold all
 # others in one place.
 FAR_OUT = 1e12
 
 NEIGHBOURS = 8  # what lies in a group of more belongs to something
+# A scanner's beams without an echo and a camera's pixels without a depth are all written as one place, mostly 0, 0, 0.
+# Nothing is within so many times the reach in which the places nearest to it have their 8th neighbour; and it has more
+# rows than so many. At 0, 0, 0, which in a map's coordinates may be on a floor, so many times its neighbours' are enough.
+_SIGN_RATIO, _SIGN_ROWS = 5.0, 8
 # How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
 # with 3 % of Gaussian noise none is beyond the first pair; the second is for what is near the surface, once the far is
 # gone. Laplace noise has a few beyond the first: so few are noise, but for those that make the bounding sphere larger.
@@ -50,6 +54,35 @@ def far_out(xyz: Floats) -> npt.NDArray[np.bool_]:
         return none
     far: npt.NDArray[np.bool_] = np.abs(xyz / 2 - middle).max(axis=1) / FAR_OUT > reach
     return far
+
+
+def without_data(places: Floats, shared: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Say of each place (U, 3), all different, whether it is a sign for "no data": (U,).
+
+    shared: (U,) how many rows have it. Asked are 0, 0, 0 and the place that most rows have, if more than 8 do.
+    """
+    signs = np.zeros(len(places), dtype=bool)
+    zero = np.flatnonzero(places[:, 0] == 0)
+    zero = zero[~places[zero].any(axis=1)]
+    most = int(shared.argmax()) if len(shared) else 0
+    asked = {*zero.tolist(), *([most] if len(shared) and shared[most] > _SIGN_ROWS else [])}
+    _, reach = half_reach(places) if asked else (None, 0.0)
+    if len(places) <= NEIGHBOURS + 1 or reach == 0:
+        return signs
+
+    def away_from(row: int) -> Floats:
+        """Return the squared distance of each place, (U,), in a unit in which none overflows."""
+        squares: Floats = sum(np.square((column / 2 - column[row] / 2) / reach) for column in places.T)
+        return squares
+
+    for row in asked:
+        away = away_from(row)
+        away[row] = np.inf
+        near = np.argpartition(away, NEIGHBOURS)[:NEIGHBOURS]
+        spacing = np.median([np.partition(away_from(other), NEIGHBOURS)[NEIGHBOURS] for other in near])
+        alone = away[near].min() > _SIGN_RATIO**2 * spacing
+        signs[row] = alone or (row in zero and shared[row] > _SIGN_ROWS * shared[near].max())
+    return signs
 
 
 def isolated(xyz: Floats, *, workers: int = 1, spacings: tuple[Floats, Floats] | None = None) -> npt.NDArray[np.bool_]:

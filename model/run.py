@@ -16,7 +16,7 @@ from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
-from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated
+from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated, without_data
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
 from straightpcf.model.spread import ROUNDS
@@ -64,7 +64,7 @@ class DenoiseResult:
 
     xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
     distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not finite,
-    or so far out or alone that they belong to nothing, and passed through.
+    meant "no data", or were so far out or alone that they belong to nothing, and passed through.
     """
 
     xyz: npt.NDArray[np.float64]
@@ -88,10 +88,15 @@ class Run:
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
         self.far_out_count = len(xyz) - self.not_finite - len(self.rows)
-        if len(self.rows) < MIN_POINTS:
-            others = f"{self.not_finite} not finite, {self.far_out_count} far out"
-            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
+        self.without_data_count = 0
+        self._require_enough()
         self._take()
+        signs = without_data(self.points.xyz, np.bincount(self.points.inverse))[self.points.inverse]
+        self.without_data_count = int(signs.sum())
+        if self.without_data_count:
+            self.rows = self.rows[~signs]
+            self._require_enough()
+            self._take()
         self._first: Tiling | None = None  # of the points as they came
         apart = self._apart()
         self.apart_count = int(apart.sum())
@@ -107,6 +112,11 @@ class Run:
         self._rounds = ROUNDS  # of spreading, before each pass but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
+
+    def _require_enough(self) -> None:
+        if len(self.rows) < MIN_POINTS:
+            others = f"{self.not_finite} not finite, {self.far_out_count} far out, {self.without_data_count} no data"
+            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
 
     def _of_rows(self) -> npt.NDArray[np.float64]:
         """Return the rows that are filtered, without a copy where they are all."""
@@ -203,6 +213,8 @@ class Run:
         if self.far_out_count:
             farther = f"more than {FAR_OUT:.0e} times as far out as half of the others"
             said.append(f"{self.far_out_count} points are {farther} and were passed through")
+        if self.without_data_count:
+            said.append(f'{self.without_data_count} points are in a place that means "no data" and were passed through')
         if self.apart_count:
             said.append(f"{self.apart_count} points lie apart from all others and were passed through")
         return said

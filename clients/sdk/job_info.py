@@ -19,8 +19,8 @@ __all__ = ["FINISHED", "STATES", "JobInfo", "JobState", "Report", "ResultInfo"]
 class Report:
     """Tell what was done to a cloud; lengths in its own unit, NaN if unknown.
 
-    untouched: points that were NaN, infinite or apart from all others, and passed through. distances: the
-    DistanceModule's median before each pass and after the last. displacement: "p50", "p90", "p99", "max", "mean" of how
+    untouched: points that were NaN, infinite, meant "no data" or lay apart from all others, and passed through.
+    distances: the DistanceModule's median before each pass and after the last. displacement: "p50", "p90", "p99", "max", "mean" of how
     far points moved. timings: seconds of "read", "filter", "write".
     """
 

@@ -65,7 +65,7 @@ class Denoised:
 
     @property
     def untouched(self) -> int:
-        """How many points were NaN, infinite or apart from all others, and passed through."""
+        """How many points were NaN, infinite, meant "no data" or lay apart from all others, and passed through."""
         return self.report.untouched
 
     @cached_property

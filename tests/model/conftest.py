@@ -7,9 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from straightpcf.model.filter import Filter
+from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.train import loop
 from tests.clouds import sphere, torus
+
+
+@pytest.fixture(scope="session")
+def tiny() -> Filter:
+    """An untrained narrow network: enough for everything but quality, and fast."""
+    torch.manual_seed(0)
+    return Filter(StraightPCF(width=64, distance_width=64), threads=2, coverage=2)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from straightpcf.model.filter import MIN_POINTS, Filter, device_named, load_filter
-from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import DeviceUnavailable, InvalidCloud, InvalidOptions, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
@@ -24,13 +23,6 @@ ONE_PASS = DenoiseOptions(iterations=1)
 @pytest.fixture(scope="module")
 def shipped() -> Filter:
     return load_filter(device="cpu")
-
-
-@pytest.fixture(scope="module")
-def tiny() -> Filter:
-    """An untrained narrow network: enough for everything but quality, and fast."""
-    torch.manual_seed(0)
-    return Filter(StraightPCF(width=64, distance_width=64), threads=2, coverage=2)
 
 
 def test_noise_shrinks_on_a_torus(shipped: Filter) -> None:

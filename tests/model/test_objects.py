@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from straightpcf.model.filter import Filter, load_filter
-from straightpcf.model.nets.straightpcf import StraightPCF
 from straightpcf.model.objects import separate_objects
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 AWAY = np.array([9.0, 0.0, 0.0])
-
-
-@pytest.fixture(scope="module")
-def tiny() -> Filter:
-    torch.manual_seed(0)
-    return Filter(StraightPCF(width=64, distance_width=64), threads=2, coverage=2)
 
 
 def parted(*objects: np.ndarray) -> list[int]:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import DenoiseResult, Filter, load_filter
-from straightpcf.model.outliers import isolated
+from straightpcf.model.outliers import isolated, without_data
+from straightpcf.points.errors import TooFewPoints
+from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, noisy, sphere, torus
 
 
@@ -118,3 +120,53 @@ def test_a_scene_keeps_its_sparse_parts() -> None:
     turn = rng.uniform(0, 2 * np.pi, 40_000)
     ground = np.stack([far * np.cos(turn), far * np.sin(turn), np.zeros(40_000)], axis=1)
     assert not isolated(ground / np.abs(ground).max()).any()
+
+
+def plate_around_a_scanner(count: int) -> np.ndarray:
+    """Points of a floor 1.8 below its scanner at 0, 0, 0, fewer with the distance."""
+    rng = np.random.default_rng(0)
+    away, turn = rng.exponential(4.0, count) + 1, rng.uniform(0, 2 * np.pi, count)
+    return np.stack([away * np.cos(turn), away * np.sin(turn), np.full(count, -1.8)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("sign", "rows", "offset"),
+    [(0.0, 1, 0.0), (0.0, 300, 0.0), (0.0, 1, 5e6), (0.0, 300, 5e6), (-9999.0, 300, 0.0), (-9999.0, 300, 5e6)],
+)
+def test_rows_in_a_place_that_means_no_data_stay_and_harm_no_other(
+    tiny: Filter, sign: float, rows: int, offset: float
+) -> None:
+    ground = plate_around_a_scanner(3000) + offset
+    alone = tiny.denoise(ground, DenoiseOptions(iterations=1))
+    result = tiny.denoise(np.vstack([ground, np.full((rows, 3), sign)]), DenoiseOptions(iterations=1))
+    assert np.array_equal(result.xyz[:3000], alone.xyz)
+    assert (result.xyz[3000:] == sign).all()
+    assert result.untouched == rows + alone.untouched
+    assert result.warnings[0] == f'{rows} points are in a place that means "no data" and were passed through'
+
+
+def test_many_zeros_mean_no_data_on_a_floor_too() -> None:
+    floor = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * [1, 1, 0]
+    floor[0] = 0
+    assert not without_data(floor, np.ones(5000, dtype=np.int64)).any()
+    assert np.flatnonzero(without_data(floor, np.where(np.arange(5000) == 0, 40, 1))).tolist() == [0]
+
+
+def test_places_that_points_share_mean_something_beside_others() -> None:
+    rng = np.random.default_rng(0)
+    for cells in (np.round(20 * sphere(20_000)) / 20, np.round(5 * rng.standard_normal((9000, 3)))):
+        places, shared = np.unique(cells + 0.0, axis=0, return_counts=True)
+        assert shared.max() > 8
+        assert not without_data(places, shared).any()
+    padded = torus(3000)
+    assert not without_data(padded, np.where(np.arange(3000) == 7, 500, 1)).any()
+
+
+@pytest.mark.parametrize("count", range(12))
+def test_few_places_mean_something(count: int) -> None:
+    assert not without_data(np.arange(3.0 * count).reshape(-1, 3), np.full(count, 9)).any()
+
+
+def test_too_few_points_beside_those_without_data_are_refused(tiny: Filter) -> None:
+    with pytest.raises(TooFewPoints, match=r"32 points to filter .* 500 no data"):
+        tiny.denoise(np.vstack([torus(32) + 10, np.zeros((500, 3))]))
