@@ -21,7 +21,7 @@ FAR_OUT = 1e12
 NEIGHBOURS = 8  # what lies in a group of more belongs to something
 # A scanner's beams without an echo and a camera's pixels without a depth are all written as one place, mostly 0, 0, 0.
 # Nothing is within so many times the reach in which the places nearest to it have their 8th neighbour; and it has more
-# rows than so many. At 0, 0, 0, which in a map's coordinates may be on a floor, so many times its neighbours' are enough.
+# rows than so many. At 0, 0, 0, which in a map's coordinates may be on a floor, so many times its neighbours' will do.
 _SIGN_RATIO, _SIGN_ROWS = 5.0, 8
 # How far a point's 8th neighbour is, beside nine tenths of all points and beside the point's own neighbours. Of clouds
 # with 3 % of Gaussian noise none is beyond the first pair; the second is for what is near the surface, once the far is

@@ -20,8 +20,8 @@ class Report:
     """Tell what was done to a cloud; lengths in its own unit, NaN if unknown.
 
     untouched: points that were NaN, infinite, meant "no data" or lay apart from all others, and passed through.
-    distances: the DistanceModule's median before each pass and after the last. displacement: "p50", "p90", "p99", "max", "mean" of how
-    far points moved. timings: seconds of "read", "filter", "write".
+    distances: the DistanceModule's median before each pass and after the last. displacement: "p50", "p90", "p99",
+    "max", "mean" of how far points moved. timings: seconds of "read", "filter", "write".
     """
 
     points: int

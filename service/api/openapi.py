@@ -173,7 +173,7 @@ _HEADERS = {
     "X-Iterations": ("Passes of the filter.", "integer", 2),
     "X-Noise-Before": ("Estimated noise of the input, in the cloud's unit; nan if unknown.", "string", "0.0123"),
     "X-Noise-After": ("Estimated noise of the result.", "string", "0.0021"),
-    "X-Untouched": ("Points passed through: not finite, of no data, too far out or apart from all others.", "integer", 0),
+    "X-Untouched": ("Points passed through: not finite, no data, too far out or apart from all others.", "integer", 0),
     "Content-Disposition": ("The name of the result.", "string", 'attachment; filename="scan_clean.ply"'),
     "ETag": ("The sha256 of the result in hex.", "string", f'"{_SHA256}"'),
     "Repr-Digest": ("The same as RFC 9530 has it.", "string", "sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"),
