@@ -30,6 +30,18 @@ def test_points_in_one_place_are_shown(page: Any, tmp_path: Path) -> None:
     assert (middle != shown[5, width // 2]).any()
 
 
+def test_zeros_that_mean_no_data_change_nothing_of_the_view(page: Any, tmp_path: Path) -> None:
+    empty = _drawn(page)
+    cloud = torus(900) + [5e5, 4e6, 300.0]  # in a map's coordinates, far from its zeros
+    alone = (_shown(page, tmp_path / "alone.npy", cloud) != empty).any(axis=2)
+    beside = (_shown(page, tmp_path / "beside.npy", np.vstack([cloud, np.zeros((30, 3))])) != empty).any(axis=2)
+    assert alone.mean() > 0.05
+    for axis in (0, 1):
+        seen = [np.flatnonzero(each.any(axis=axis))[[0, -1]] for each in (alone, beside)]
+        np.testing.assert_allclose(*seen, atol=2)
+    assert (alone != beside).mean() < 0.2 * alone.mean()
+
+
 def test_a_long_name_does_not_widen_the_page(page: Any, tmp_path: Path) -> None:
     (file := tmp_path / f"{'a_name_without_a_break_' * 9}.txt").write_text("0 0 0\n1 1 1\n")
     page.set_input_files("#file", file)

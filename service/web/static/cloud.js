@@ -76,13 +76,18 @@ export class Cloud {
     return { low, top: at(0.99) };
   }
 
-  // Call visit(x, y, z) for some thousand points that have a position.
+  // Call visit(x, y, z) for some thousand points that have a position; not those at 0, 0, 0, which in a scan mean
+  // "no data", but where there are no others.
   eachSample(visit) {
     const step = Math.max(1, Math.floor(this.shown / SAMPLE));
+    const zero = this.origin?.map((value) => Math.fround(-value));
+    const points = [];
     for (let slot = 0; slot < this.shown; slot += step) {
-      const [x, y, z] = this.after.subarray(4 * slot, 4 * slot + 3);
-      if (x > UNKNOWN / 2 && Number.isFinite(x + y + z)) visit(x, y, z);
+      const point = this.after.subarray(4 * slot, 4 * slot + 3);
+      if (point[0] > UNKNOWN / 2 && point.every(Number.isFinite)) points.push(point);
     }
+    const others = points.filter((point) => point.some((value, axis) => value !== zero[axis]));
+    for (const point of others.length > 0 ? others : points) visit(...point);
   }
 
   // Centre and radius of what is there, relative to the origin: a box of the middle 99.8 %, so that strays do not count.
@@ -104,15 +109,12 @@ export class Cloud {
   }
 }
 
-// The middle of the box of the finite points: what float32 has to carry stays small.
+// The median of the finite points: what float32 has to carry stays small, also beside a row of zeros in a map's coordinates.
 function centreOf(xyz) {
-  const low = [Infinity, Infinity, Infinity];
-  const high = [-Infinity, -Infinity, -Infinity];
-  for (let item = 0; item < xyz.length; item++) {
-    const value = xyz[item];
-    const axis = item % 3;
-    if (value < low[axis]) low[axis] = value;
-    if (value > high[axis]) high[axis] = value;
-  }
-  return low.map((value, axis) => (Number.isFinite(value + high[axis]) ? (value + high[axis]) / 2 : 0));
+  const step = 3 * Math.max(1, Math.floor(xyz.length / 3 / SAMPLE));
+  return [0, 1, 2].map((axis) => {
+    const values = [];
+    for (let item = axis; item < xyz.length; item += step) if (Number.isFinite(xyz[item])) values.push(xyz[item]);
+    return values.length > 0 ? Float64Array.from(values).sort()[values.length >> 1] : 0;
+  });
 }
