@@ -32,7 +32,7 @@ def test_points_in_one_place_are_shown(page: Any, tmp_path: Path) -> None:
 
 def test_zeros_that_mean_no_data_change_nothing_of_the_view(page: Any, tmp_path: Path) -> None:
     empty = _drawn(page)
-    cloud = torus(900) + [5e5, 4e6, 300.0]  # in a map's coordinates, far from its zeros
+    cloud = torus(900) + np.array([5e5, 4e6, 300.0])  # in a map's coordinates, far from its zeros
     alone = (_shown(page, tmp_path / "alone.npy", cloud) != empty).any(axis=2)
     beside = (_shown(page, tmp_path / "beside.npy", np.vstack([cloud, np.zeros((30, 3))])) != empty).any(axis=2)
     assert alone.mean() > 0.05
