@@ -124,7 +124,8 @@ class NoiseReader:
         probes, numbers = tiling.probes()
         if first is None:
             axis = height_axis(positions) if self._zoom else None
-            scene = axis is not None or is_scene(_quantile(probes.radii, probes.owned, 0.5))
+            radii = (_quantile(probes.radii, probes.owned, share) for share in (0.1, 0.5, 0.9))
+            scene = axis is not None or is_scene(*radii)
         else:
             axis, scene = first.height_axis, first.scene
         if scene:

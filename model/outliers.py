@@ -186,4 +186,4 @@ def _looked_around(xyz: Floats, places: Floats, count: int, workers: int) -> tup
 def _is_scene(xyz: Floats) -> bool:
     size = min(PATCH_SIZE, len(xyz))
     radii = cKDTree(xyz).query(xyz[:: max(1, len(xyz) // _PROBES)], k=[size])[0]
-    return is_scene(float(np.median(radii)) / max(CloudFrame.of(xyz).radius, 1e-300))
+    return is_scene(*(np.quantile(radii, (0.1, 0.5, 0.9)) / max(CloudFrame.of(xyz).radius, 1e-300)).tolist())

@@ -229,8 +229,9 @@ def test_as_many_places_as_a_patch_has_at_least_are_filtered(tiny: Filter) -> No
 
 
 def test_points_in_one_place_move_together_and_cost_no_patches(tiny: Filter) -> None:
-    """A depth camera writes its invalid pixels as zeros: thousands of equal points."""
-    cloud = np.concatenate([noisy(torus(1500), 0.01), np.zeros((6000, 3))])
+    """What fills clouds up to one number of points are copies: thousands of equal points."""
+    cloud = noisy(torus(1500), 0.01)
+    cloud = np.concatenate([cloud, np.repeat(cloud[:1], 6000, axis=0)])
     patches = list(tiny.patches(cloud, ONE_PASS))
     assert len(patches) < 10
     assert sum(len(patch.indices) for patch in patches) == 7500

@@ -20,7 +20,7 @@ from straightpcf.model.normalize import (
 
 def test_an_objects_patches_keep_the_papers_frame() -> None:
     radii = np.array([0.13, 0.2, 0.35, 0.5])
-    assert not is_scene(float(np.median(radii)))
+    assert not is_scene(*np.quantile(radii, (0.1, 0.5, 0.9)))
     np.testing.assert_array_equal(patch_scales(radii, scene=False), 1.0)
     tiny, wide = patch_scales(np.array([0.05, 2.0]), scene=False) * [0.05, 2.0]
     assert (tiny, wide) == pytest.approx((0.1, 0.58))
@@ -28,8 +28,14 @@ def test_an_objects_patches_keep_the_papers_frame() -> None:
 
 def test_a_scenes_patches_are_shown_at_the_usual_size() -> None:
     radii = np.array([0.01, 0.02, 0.04, 0.3, 0.9])
-    assert is_scene(float(np.median(radii)))
+    assert is_scene(*np.quantile(radii, (0.1, 0.5, 0.9)))
     np.testing.assert_allclose(radii * patch_scales(radii, scene=True), [0.25, 0.25, 0.25, 0.3, 0.58])
+
+
+def test_a_room_of_few_points_is_a_scene_by_how_unlike_its_patches_are() -> None:
+    assert is_scene(0.054, 0.155, 0.249)  # 66,800 points, as a scanner in the room has them
+    assert not is_scene(0.2, 0.368, 0.55)  # the most unlike of what scanners see of solids
+    assert not is_scene(0.0, 0.2, 0.3)
 
 
 def test_a_patch_without_extent_keeps_its_factor() -> None:
