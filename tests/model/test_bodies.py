@@ -43,7 +43,7 @@ def test_a_flattened_limb_is_as_thin_as_it_says() -> None:
 @pytest.mark.parametrize("family", [creature, carving])
 def test_the_gradient_is_that_of_the_value(family: Callable[[np.random.Generator], Body]) -> None:
     body = family(np.random.default_rng(0))
-    xyz, normals = body.sample(np.random.default_rng(1), 500)
+    xyz, normals = body.sample(np.random.default_rng(1), 200)
     value, gradient = body.value(xyz)
     assert np.abs(value).max() < 1e-8
     numeric = numeric_gradient(lambda points: body.value(points)[0], xyz)

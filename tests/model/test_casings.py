@@ -73,7 +73,7 @@ def test_a_step_along_the_normal_leaves_the_body_and_one_against_it_enters(
 ) -> None:
     rng = np.random.default_rng(1)
     body = family(rng)
-    xyz, normals = body.sample(rng, 2000)
+    xyz, normals = body.sample(rng, 1000)
     assert np.abs(body.value(xyz)[0]).max() < 1e-8
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     assert (~body.contains(xyz + 1e-4 * normals)).mean() > 0.995

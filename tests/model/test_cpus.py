@@ -99,10 +99,11 @@ def test_no_more_threads_look_up_neighbours_than_a_filter_has(monkeypatch: pytes
     for module in ("patches", "tiles", "spread", "outliers"):
         monkeypatch.setattr(f"straightpcf.model.{module}.cKDTree", Tree)
     network = StraightPCF(width=16, distance_width=16)
-    cloud, results = noisy(torus(11_000), 0.01), []
+    monkeypatch.setattr("straightpcf.model.filter.MIN_TILE_POINTS", 4000)
+    cloud, results = noisy(torus(4400), 0.01), []
     for threads in (1, 2):
         taken.clear()
-        model = Filter(network, threads=threads, coverage=1, tile_points=10_000)
+        model = Filter(network, threads=threads, coverage=1, tile_points=4000)
         results.append(model.denoise(cloud, DenoiseOptions(iterations=1)).xyz)
         assert max(taken) == threads
         assert min(taken) >= 1

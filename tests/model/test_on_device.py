@@ -52,7 +52,7 @@ def on_device(
     return model
 
 
-@pytest.mark.parametrize("count", [500, 3000, 6000])  # one patch, fewer than a batch, a last batch that is not full
+@pytest.mark.parametrize("count", [500, 3000, 4400])  # one patch, fewer than a batch, a last batch that is not full
 def test_a_device_gives_what_the_host_gives(network: StraightPCF, count: int) -> None:
     cloud = noisy(torus(count), 0.01)
     options = DenoiseOptions(iterations=3)
@@ -164,7 +164,7 @@ def test_where_capturing_fails_the_work_goes_on_without_graphs(network: Straight
     def refuse(run: Again) -> tuple[Callable[[], object], torch.Tensor]:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    cloud = noisy(torus(6000), 0.01)
+    cloud = noisy(torus(4400), 0.01)
     with pytest.warns(UserWarning, match="not permitted"):
         result = on_device(network, capture=refuse).denoise(cloud, DenoiseOptions(iterations=1))
     expected = Filter(network, threads=1, coverage=3).denoise(cloud, DenoiseOptions(iterations=1))
@@ -191,7 +191,7 @@ class _SmallMemory(torch.nn.Module):
 
 
 def test_out_of_memory_halves_the_batch_and_goes_on(network: StraightPCF) -> None:
-    cloud, options = noisy(torus(4000), 0.01), DenoiseOptions(iterations=1)
+    cloud, options = noisy(torus(3000), 0.01), DenoiseOptions(iterations=1)
     small = on_device(_SmallMemory(network, 3), batch=8)
     expected = Filter(network, threads=1, coverage=3).denoise(cloud, options).xyz
     np.testing.assert_allclose(small.denoise(cloud, options).xyz, expected, atol=1e-6)
