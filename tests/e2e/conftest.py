@@ -16,7 +16,7 @@ from tests.conftest import RunningServer
 
 __all__ = ["POINTS", "picture"]
 
-POINTS = 2500
+POINTS = 1000
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 _UNANSWERED = "Failed to load resource: net::ERR_"
 FLAGS = (
