@@ -62,12 +62,15 @@ def without_data(places: Floats, shared: npt.NDArray[np.int64]) -> npt.NDArray[n
     shared: (U,) how many rows have it. Asked are 0, 0, 0 and the place that most rows have, if more than 8 do.
     """
     signs = np.zeros(len(places), dtype=bool)
+    if len(places) <= NEIGHBOURS + 1:
+        return signs
     zero = np.flatnonzero(places[:, 0] == 0)
     zero = zero[~places[zero].any(axis=1)]
-    most = int(shared.argmax()) if len(shared) else 0
-    asked = {*zero.tolist(), *([most] if len(shared) and shared[most] > _SIGN_ROWS else [])}
+    asked, most = set(zero.tolist()), int(shared.argmax())
+    if shared[most] > _SIGN_ROWS:
+        asked.add(most)
     _, reach = half_reach(places) if asked else (None, 0.0)
-    if len(places) <= NEIGHBOURS + 1 or reach == 0:
+    if reach == 0:
         return signs
 
     def away_from(row: int) -> Floats:

@@ -88,21 +88,10 @@ class Run:
         self.not_finite = len(xyz) - len(self.rows)
         self.rows = self.rows[~far_out(self._of_rows())]
         self.far_out_count = len(xyz) - self.not_finite - len(self.rows)
-        self.without_data_count = 0
-        self._require_enough()
-        self._take()
-        signs = without_data(self.points.xyz, np.bincount(self.points.inverse))[self.points.inverse]
-        self.without_data_count = int(signs.sum())
-        if self.without_data_count:
-            self.rows = self.rows[~signs]
-            self._require_enough()
-            self._take()
         self._first: Tiling | None = None  # of the points as they came
-        apart = self._apart()
-        self.apart_count = int(apart.sum())
-        if self.apart_count:
-            self.rows, self._first = self.rows[~apart], None
-            self._take()
+        self._take()
+        self.without_data_count = self._set_aside(without_data(self.points.xyz, np.bincount(self.points.inverse)))
+        self.apart_count = self._set_aside(self._apart())
         self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held_back = np.zeros(len(self.moved), dtype=bool)
@@ -113,30 +102,37 @@ class Run:
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
 
-    def _require_enough(self) -> None:
-        if len(self.rows) < MIN_POINTS:
-            others = f"{self.not_finite} not finite, {self.far_out_count} far out, {self.without_data_count} no data"
-            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
-
     def _of_rows(self) -> npt.NDArray[np.float64]:
         """Return the rows that are filtered, without a copy where they are all."""
         return self.xyz if len(self.rows) == len(self.xyz) else self.xyz[self.rows]
 
+    def _set_aside(self, places: npt.NDArray[np.bool_]) -> int:
+        """Leave out the rows in some of the places, (U,); return how many these are."""
+        if not places.any():
+            return 0
+        before, self._first = len(self.rows), None
+        self.rows = self.rows[~places[self.points.inverse]]
+        self._take()
+        return before - len(self.rows)
+
     def _take(self) -> None:
+        if len(self.rows) < MIN_POINTS:
+            without_data = len(self.xyz) - self.not_finite - self.far_out_count - len(self.rows)
+            others = f"{self.not_finite} not finite, {self.far_out_count} far out, {without_data} no data"
+            raise TooFewPoints(f"{len(self.rows)} points to filter ({others}); at least {MIN_POINTS}")
         cloud = self._of_rows()
         self.frame = CloudFrame.of(cloud)
         self.points = Distinct(cloud, cell=cell_of(cloud))
 
     def _apart(self) -> npt.NDArray[np.bool_]:
-        """Say which of the rows lie apart from all others; where a cloud is too large to be looked at as one, none."""
+        """Say which places lie apart from all others; where a cloud is too large to be looked at as one, none."""
         if self.frame.radius == 0.0 or not _FEWEST_APART <= len(self.points.xyz) <= self.filter.tile_points:
-            return np.zeros(len(self.rows), dtype=bool)
+            return np.zeros(len(self.points.xyz), dtype=bool)
         positions = self.frame.enter(self.points.xyz)
         self._first = self._tiling(positions)
         self._first.expect_parts()
         spacings = self.filter.processor.spacings(positions, self._first, NEIGHBOURS)
-        apart = isolated(positions, workers=self.filter.threads, spacings=spacings)
-        return apart[self.points.inverse]
+        return isolated(positions, workers=self.filter.threads, spacings=spacings)
 
     def patches(self) -> Iterator[FinishedPatch]:
         """Run pass after pass; none where there is nothing to tell noise from."""

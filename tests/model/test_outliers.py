@@ -36,6 +36,13 @@ def in_the_air(count: int, reach: float) -> np.ndarray:
     return np.random.default_rng(5).uniform(-reach, reach, (count, 3))
 
 
+def floor_around_a_scanner(count: int) -> np.ndarray:
+    """Points of a floor 1.8 below its scanner at 0, 0, 0, fewer with the distance."""
+    rng = np.random.default_rng(0)
+    away, turn = rng.exponential(4.0, count) + 1, rng.uniform(0, 2 * np.pi, count)
+    return np.stack([away * np.cos(turn), away * np.sin(turn), np.full(count, -1.8)], axis=1)
+
+
 @pytest.mark.parametrize("reach", [1.3, 4.0, 1000.0])
 # Between these levels of noise a last bit decides whether `auto` polishes this torus.
 @pytest.mark.parametrize("noise_std", [0.004, 0.01])
@@ -115,18 +122,8 @@ def test_groups_and_halves_belong_to_something() -> None:
 
 
 def test_a_scene_keeps_its_sparse_parts() -> None:
-    rng = np.random.default_rng(0)
-    far = rng.exponential(4.0, 40_000) + 1  # a ground whose points get fewer with the distance
-    turn = rng.uniform(0, 2 * np.pi, 40_000)
-    ground = np.stack([far * np.cos(turn), far * np.sin(turn), np.zeros(40_000)], axis=1)
+    ground = floor_around_a_scanner(40_000)
     assert not isolated(ground / np.abs(ground).max()).any()
-
-
-def plate_around_a_scanner(count: int) -> np.ndarray:
-    """Points of a floor 1.8 below its scanner at 0, 0, 0, fewer with the distance."""
-    rng = np.random.default_rng(0)
-    away, turn = rng.exponential(4.0, count) + 1, rng.uniform(0, 2 * np.pi, count)
-    return np.stack([away * np.cos(turn), away * np.sin(turn), np.full(count, -1.8)], axis=1)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +133,7 @@ def plate_around_a_scanner(count: int) -> np.ndarray:
 def test_rows_in_a_place_that_means_no_data_stay_and_harm_no_other(
     tiny: Filter, sign: float, rows: int, offset: float
 ) -> None:
-    ground = plate_around_a_scanner(3000) + offset
+    ground = floor_around_a_scanner(3000) + offset
     alone = tiny.denoise(ground, DenoiseOptions(iterations=1))
     result = tiny.denoise(np.vstack([ground, np.full((rows, 3), sign)]), DenoiseOptions(iterations=1))
     assert np.array_equal(result.xyz[:3000], alone.xyz)

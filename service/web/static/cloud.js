@@ -109,7 +109,8 @@ export class Cloud {
   }
 }
 
-// The median of the finite points: what float32 has to carry stays small, also beside a row of zeros in a map's coordinates.
+// The median of the finite points: what float32 has to carry stays small, also beside a row of zeros in a map's
+// coordinates.
 function centreOf(xyz) {
   const step = 3 * Math.max(1, Math.floor(xyz.length / 3 / SAMPLE));
   return [0, 1, 2].map((axis) => {
