@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Generator, Iterator
-from contextlib import aclosing, closing
+from collections.abc import AsyncGenerator, AsyncIterator, Coroutine, Generator, Iterator
+from contextlib import aclosing, asynccontextmanager, closing
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from straightpcf.clients.sdk.receive import Receiver
@@ -33,6 +33,8 @@ except ImportError as exc:
     raise MissingDependency(f"grpc:// needs an extra: pip install 'straightpcf[grpc]' ({exc})") from exc
 
 __all__ = ["AsyncGrpcTransport", "GrpcTransport"]
+
+_T = TypeVar("_T")
 
 _SHORT = frozenset(("GetJob", "ListJobs", "CancelJob", "DeleteJob", "GetServerInfo", "GetHealth"))
 # A dead peer is noticed by pings before the silence is too long.
@@ -135,7 +137,8 @@ class AsyncGrpcTransport(AsyncTransport):
 
     async def _messages(self, call: Call, send: Any, silence: Silence, attempts: Attempts) -> AsyncGenerator[Any]:
         coming = getattr(self._stub, call.rpc)(send, **_how(call, self._key, self.timeout))
-        async with silence.watched_here(coming):
+        ending = _Ending(coming)
+        async with ending.told(), silence.watched_here(coming):
             if hasattr(coming, "__aiter__"):
                 if await coming.initial_metadata():
                     attempts.answered()
@@ -154,6 +157,50 @@ class AsyncGrpcTransport(AsyncTransport):
             else:
                 self._channel = grpc.aio.secure_channel(target, credentials, options=_OPTIONS)
             self._stub = _stub(self._channel)
+
+
+class _Ending:
+    """Keep the status that the other side gave a call.
+
+    What is still being sent then fails, and grpc.aio puts an INTERNAL of its own in the status's place: a refusal
+    would be told as that (grpc/grpc#36066, open with grpcio 1.85).
+    """
+
+    def __init__(self, coming: Any) -> None:
+        self._error: grpc.aio.AioRpcError | None = None
+        coming.add_done_callback(self._keep)
+
+    @asynccontextmanager
+    async def told(self) -> AsyncGenerator[None]:
+        """Raise what was kept where gRPC raises its own."""
+        try:
+            yield
+        except grpc.aio.AioRpcError as error:
+            if self._error is None or not _is_of_a_failed_write(error):
+                raise
+            raise self._error from None
+
+    def _keep(self, coming: Any) -> None:
+        code, details = _at_once(coming.code()), _at_once(coming.details())
+        if self._error is None and code is not grpc.StatusCode.OK:
+            beside = [_at_once(metadata) for metadata in (coming.initial_metadata(), coming.trailing_metadata())]
+            error = grpc.aio.AioRpcError(code, *beside, details=details)
+            if not _is_of_a_failed_write(error):
+                self._error = error
+
+
+def _is_of_a_failed_write(error: grpc.aio.AioRpcError) -> bool:
+    return error.code() is grpc.StatusCode.INTERNAL and error.details() == "Internal error from Core"
+
+
+def _at_once(known: Coroutine[Any, Any, _T]) -> _T:
+    """Return what a coroutine returns that has nothing to wait for: in a task it would be read too late."""
+    try:
+        known.send(None)
+    except StopIteration as end:
+        return end.value  # type: ignore[no-any-return]
+    known.close()
+    raise AssertionError("a call that is over does not know how it ended")
 
 
 def _stub(channel: Any) -> Any:

@@ -40,3 +40,21 @@ def test_who_asks_too_often_may_still_end_what_was_begun(tmp_path: Path, scheme:
             assert not (await engine.list())[0]
 
     play(scenario)
+
+
+def test_an_upload_that_is_refused_on_its_way_is_told_why(tmp_path: Path) -> None:
+    """Of one in a hundred gRPC puts an INTERNAL of its own in the refusal's place (grpc/grpc#36066)."""
+
+    async def scenario() -> None:
+        limits = {"rate_per_minute": 1, "grpc_port": (port := free_port())}
+        async with (
+            serving(tmp_path, willing(), **limits) as (_, host, _),
+            AsyncClient(f"grpc://{host}:{port}", max_retries=0) as client,
+        ):
+            with pytest.raises(RateLimited):  # by the second request
+                await client.denoise(CLOUD, name="a.xyz", timeout=30)
+            for _ in range(300):
+                with pytest.raises(RateLimited):
+                    await client.denoise(20_000 * b"0.1 0.2 0.3\n", name="a.xyz", timeout=30)
+
+    play(scenario)
