@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods, surface_terms
 
-__all__ = ["NeighbourhoodNoise", "low_noise_weight", "wiener_weighted"]
+__all__ = ["NeighbourhoodNoise", "limited_to_surfaces", "low_noise_weight", "wiener_weighted"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,6 +30,12 @@ _LOW_NOISE_RATIO, _HIGH_NOISE_RATIO = 0.05, 0.08
 # A point so many times that noise from its neighbours' surface, of which the network takes off so much, is one
 # with more noise than the others.
 _OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
+# Of a scene the noise of a place is what a tenth of its surfaces leave, or less, which is so much less than the noise
+# where all are of one plane (the std of so few heights, chi of 10 degrees of freedom). Each is fitted to 16 of so many
+# nearest; those of a line tell nothing (the lesser std along their plane below a share of the greater).
+_SCENE_QUANTILE, _SCENE_QUANTILE_STD, _SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.2
+# It is not the noise where that is as large as the neighbourhood: the nearest of a thick slab fill a ball.
+_SEEN_UP_TO_RADII, _UNSEEN_FROM_RADII = 0.05, 0.1
 _LEAST_LEVERAGE_LEFT = 0.1  # of a point's residual, what the fit to itself has left
 
 
@@ -97,6 +103,31 @@ def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
     out = (np.abs(own) > _OUTLIER_STDS * noise) & (-rise * own > _OUTLIER_STEP_SHARE * own**2)
     less: Floats = step * np.where(out, 1.0, 1.0 - low_noise * (1.0 - weight))[:, None]
     return less
+
+
+def limited_to_surfaces(step: Floats, patch: Floats) -> Floats:
+    """Return a scene's step (n, 3), less of it where it is more than what surfaces through few neighbours leave.
+
+    patch: (P, 3) points, of which the first n >= 1 make the step. Where points are few beside what was scanned, edges
+    and kerbs are noise to a patch of 1000, and points went a metre. Weights are Wiener's, as of `wiener_weighted`.
+    """
+    points = patch[: len(step)]
+    near = Nearest.of(points, patch, _SCENE_NEIGHBOURS).in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
+    stds = _surfaces(near).stds
+    _, less, most = np.sqrt(np.maximum(near.variances, 0.0)).T
+    tells = less > _LINE_RATIO * most
+    _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
+    counts = tells[place].sum(axis=1)
+    rising = np.sort(np.where(tells, stds, np.inf)[place], axis=1)
+    lowest = (_SCENE_QUANTILE * np.maximum(counts - 1, 0)).astype(np.int64)
+    noise = rising[np.arange(len(points)), lowest] / _SCENE_QUANTILE_STD
+    noise[2 * counts <= place.shape[1]] = np.inf
+    in_radii = noise / near.radii[place].mean(axis=1)
+    known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
+    moves = np.square(step).sum(axis=1)[place].mean(axis=1)
+    weight = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
+    less_of_it: Floats = step * (1.0 - known * (1.0 - weight))[:, None]
+    return less_of_it
 
 
 def _surfaces(near: Neighbourhoods) -> _Surfaces:

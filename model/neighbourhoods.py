@@ -16,6 +16,7 @@ __all__ = ["INNER_SHARE", "Nearest", "Neighbourhoods", "neighbourhoods", "surfac
 Floats = npt.NDArray[np.float64]
 
 _LEAST_RADIUS = 1e-12  # of a cloud in the unit ball; where points are in one place, rounding is what is left
+_SECTORS = 8  # two neighbours in each are what a surface of second order is fitted to
 INNER_SHARE = 1 / 3  # of a patch's points, those whose neighbours are in the patch, too
 
 
@@ -68,6 +69,27 @@ class Nearest:
         variances, axes = xp.linalg.eigh(local.mT @ local)
         radii = self.distances[:, :count][:, -1].clip(min=_LEAST_RADIUS)
         return Neighbourhoods(local, radii, variances, axes)
+
+    def in_all_directions(self, count: int) -> Nearest:
+        """Return `count` of them, or as many as there are, that lie around each point; where all are arrays of NumPy.
+
+        The nearest of each of eight sectors of their plane come first, then the second, and so on: of a scanner's rings
+        the nearest alone are often all of one, which lies on a cone however noisy it is.
+        """
+        across = (self.points - self.points[:, :1]) @ self.first(self.points.shape[1]).axes[:, :, 1:]
+        turn = np.arctan2(across[:, :, 1], across[:, :, 0]) / (2 * np.pi) + 0.5
+        sector = np.minimum((turn * _SECTORS).astype(np.int64), _SECTORS - 1)
+        rank = np.zeros(sector.shape, dtype=np.int64)  # in its own sector, from 1; the point itself comes before all
+        for number in range(_SECTORS):
+            here = sector == number
+            here[:, 0] = False
+            rank += np.cumsum(here, axis=1) * here
+        chosen = np.sort(np.argsort(rank, axis=1, kind="stable")[:, :count], axis=1)
+        distances, points = (
+            np.take_along_axis(a, b, 1)
+            for a, b in zip((self.distances, self.points), (chosen, chosen[:, :, None]), strict=True)
+        )
+        return Nearest(distances, points)
 
 
 def neighbourhoods(points: Floats, around: Floats, count: int) -> Neighbourhoods:

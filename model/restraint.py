@@ -1,8 +1,9 @@
 """How much of a step the network asks for is made: what is more than the noise is not.
 
-The points of a scene go no farther than its noise reaches, nowhere where they lie in no surface, not off the line that
-they lie in, and not along a surface, nor do those of an object that lie on it by chance. Those of an object with little
-noise go less far (`low_noise`), and where walls would be joined none goes (`walls`).
+The points of a scene go no farther than its noise reaches, as patches and as a few neighbours read it, nowhere where
+they lie in no surface, not off the line that they lie in, and not along a surface, nor do those of an object that lie
+on it by chance. Those of an object with little noise go less far (`low_noise`), and where walls would be joined none
+goes (`walls`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.low_noise import wiener_weighted
+from straightpcf.model.low_noise import limited_to_surfaces, wiener_weighted
 from straightpcf.model.neighbourhoods import Neighbourhoods, neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
@@ -76,6 +77,8 @@ def restrained_step(
         step = without_tangential_motion(step, patch)
     if sampling.low_noise > 0:
         step = wiener_weighted(step, patch, sampling.low_noise)
+    if trusted_noise is not None:
+        step = limited_to_surfaces(step, patch)
     return step, share < _HELD_BACK_SHARE
 
 

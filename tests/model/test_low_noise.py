@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import load_filter
-from straightpcf.model.low_noise import wiener_weighted
+from straightpcf.model.low_noise import limited_to_surfaces, wiener_weighted
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
@@ -71,3 +71,42 @@ def test_noise_that_half_of_a_surface_has_is_taken_off_there() -> None:
     rough = clean + np.where(clean[:, :1] > 0, noise, 0.0)
     result = load_filter(threads=2).denoise(rough)
     assert chamfer_distance(result.xyz, clean) < 0.65 * chamfer_distance(rough, clean)
+
+
+def floor(noise: float, spacing: float, *, rings: bool = False) -> np.ndarray:
+    """Return 1000 points of a plane, the middle first, with noise across it or along a scanner's beams."""
+    rng = np.random.default_rng(0)
+    if not rings:
+        xyz = np.column_stack([spacing * rng.uniform(-15, 15, (1000, 2)), noise * rng.standard_normal(1000)])
+        return xyz[np.argsort((xyz**2).sum(axis=1))]
+    far, turn = np.meshgrid(np.linspace(6.0, 8.0, 10), np.linspace(-0.2, 0.2, 100), indexing="ij")
+    xyz = np.column_stack([(far * np.cos(turn)).ravel(), (far * np.sin(turn)).ravel(), np.full(1000, -1.8)])
+    xyz *= 1 + noise * rng.standard_normal((1000, 1)) / np.linalg.norm(xyz, axis=1, keepdims=True)
+    return xyz[np.argsort(np.linalg.norm(xyz - [7.0, 0.0, -1.8], axis=1))]
+
+
+def test_a_scenes_step_is_no_larger_than_the_noise_that_a_few_neighbours_show() -> None:
+    around = floor(0.01, 0.3)
+    rng = np.random.default_rng(1)
+    wrong = rng.standard_normal((300, 3)) * 0.1
+    made = limited_to_surfaces(wrong, around)
+    assert np.sqrt(np.square(made).sum(axis=1).mean()) < 0.02 < np.sqrt(np.square(wrong).sum(axis=1).mean())
+    right = np.column_stack([np.zeros((300, 2)), -around[:300, 2]])
+    assert np.linalg.norm(limited_to_surfaces(right, around)) > 0.8 * np.linalg.norm(right)
+
+
+def test_a_scenes_step_stays_where_few_neighbours_do_not_show_its_noise() -> None:
+    """On a scanner's ring, which is a cone's whatever its noise, and where points lie closer than the noise is wide."""
+    for around in (floor(0.02, 0.0, rings=True), floor(0.3, 0.1)):
+        height = around[:300, 2] - np.median(around[:, 2])
+        right = np.column_stack([np.zeros((300, 2)), -height])
+        assert np.linalg.norm(limited_to_surfaces(right, around)) > 0.8 * np.linalg.norm(right)
+
+
+def test_a_scenes_few_points_and_points_in_a_line_are_no_error() -> None:
+    line = np.linspace(0, 1, 400)[:, None] * [1.0, 2.0, 3.0]
+    for xyz in (sphere(33), line, np.zeros((40, 3))):
+        step = np.full((20, 3), 0.1)
+        assert np.isfinite(limited_to_surfaces(step, xyz)).all()
+    np.testing.assert_array_equal(limited_to_surfaces(np.full((20, 3), 0.1), line), np.full((20, 3), 0.1))
+    assert len(limited_to_surfaces(np.full((1, 3), 0.1), line)) == 1
