@@ -32,8 +32,8 @@ _LOW_NOISE_RATIO, _HIGH_NOISE_RATIO = 0.05, 0.08
 _OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
 # Of a scene the noise of a place is what a tenth of its surfaces leave, or less, which is so much less than the noise
 # where all are of one plane (the std of so few heights, chi of 10 degrees of freedom). Each is fitted to 16 of so many
-# nearest; those of a line tell nothing (the lesser std along their plane below a share of the greater).
-_SCENE_QUANTILE, _SCENE_QUANTILE_STD, _SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.2
+# nearest; those of lines tell nothing (the lesser std along their plane below a share of the greater).
+_SCENE_QUANTILE, _SCENE_QUANTILE_STD, _SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.5
 # It is not the noise where that is as large as the neighbourhood: the nearest of a thick slab fill a ball.
 _SEEN_UP_TO_RADII, _UNSEEN_FROM_RADII = 0.05, 0.1
 _LEAST_LEVERAGE_LEFT = 0.1  # of a point's residual, what the fit to itself has left
