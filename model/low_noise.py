@@ -95,10 +95,10 @@ def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
     points = patch[: len(step)]
     here = _surfaces(neighbourhoods(points, patch, _FIT_NEIGHBOURS))
     rise = (step * here.normals).sum(axis=1)
-    _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
+    place = _places(points)
     noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
     moves = np.square(rise)[place].mean(axis=1)
-    weight = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
+    weight = _wiener(noise, moves)
     own = here.own_residuals
     out = (np.abs(own) > _OUTLIER_STDS * noise) & (-rise * own > _OUTLIER_STEP_SHARE * own**2)
     less: Floats = step * np.where(out, 1.0, 1.0 - low_noise * (1.0 - weight))[:, None]
@@ -109,14 +109,14 @@ def limited_to_surfaces(step: Floats, patch: Floats) -> Floats:
     """Return a scene's step (n, 3), less of it where it is more than what surfaces through few neighbours leave.
 
     patch: (P, 3) points, of which the first n >= 1 make the step. Where points are few beside what was scanned, edges
-    and kerbs are noise to a patch of 1000, and points went a metre. Weights are Wiener's, as of `wiener_weighted`.
+    and kerbs are noise to a patch of 1000. Weights are Wiener's, as of `wiener_weighted`.
     """
     points = patch[: len(step)]
     near = Nearest.of(points, patch, _SCENE_NEIGHBOURS).in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
     stds = _surfaces(near).stds
     _, less, most = np.sqrt(np.maximum(near.variances, 0.0)).T
     tells = less > _LINE_RATIO * most
-    _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
+    place = _places(points)
     counts = tells[place].sum(axis=1)
     rising = np.sort(np.where(tells, stds, np.inf)[place], axis=1)
     lowest = (_SCENE_QUANTILE * np.maximum(counts - 1, 0)).astype(np.int64)
@@ -125,9 +125,21 @@ def limited_to_surfaces(step: Floats, patch: Floats) -> Floats:
     in_radii = noise / near.radii[place].mean(axis=1)
     known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
     moves = np.square(step).sum(axis=1)[place].mean(axis=1)
-    weight = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
-    less_of_it: Floats = step * (1.0 - known * (1.0 - weight))[:, None]
+    less_of_it: Floats = step * (1.0 - known * (1.0 - _wiener(noise, moves)))[:, None]
     return less_of_it
+
+
+def _places(points: Floats) -> npt.NDArray[np.int64]:
+    """Return the rows of the points near each of (n, 3) whose noise is read as one: (n, 80), or all of them."""
+    place: npt.NDArray[np.int64]
+    _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
+    return place
+
+
+def _wiener(noise: Floats, moves: Floats) -> Floats:
+    """Return the share, 1 at most, that is made of moves of a mean square (n,) among noise of a std (n,)."""
+    weight: Floats = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
+    return weight
 
 
 def _surfaces(near: Neighbourhoods) -> _Surfaces:

@@ -85,11 +85,8 @@ class Nearest:
             here[:, 0] = False
             rank += np.cumsum(here, axis=1) * here
         chosen = np.sort(np.argsort(rank, axis=1, kind="stable")[:, :count], axis=1)
-        distances, points = (
-            np.take_along_axis(a, b, 1)
-            for a, b in zip((self.distances, self.points), (chosen, chosen[:, :, None]), strict=True)
-        )
-        return Nearest(distances, points)
+        points = np.take_along_axis(self.points, chosen[:, :, None], axis=1)
+        return Nearest(np.take_along_axis(self.distances, chosen, axis=1), points)
 
 
 def neighbourhoods(points: Floats, around: Floats, count: int) -> Neighbourhoods:
