@@ -14,9 +14,9 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from straightpcf.model.arrays import Array, namespace, on_host
-from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods, surface_terms
+from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["NeighbourhoodNoise", "limited_to_surfaces", "low_noise_weight", "wiener_weighted"]
+__all__ = ["SCENE_NEIGHBOURS", "NeighbourhoodNoise", "limited_to_surfaces", "low_noise_weight", "wiener_weighted"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
 # Of a scene the noise of a place is what a tenth of its surfaces leave, or less, which is so much less than the noise
 # where all are of one plane (the std of so few heights, chi of 10 degrees of freedom). Each is fitted to 16 of so many
 # nearest; those of lines tell nothing (the lesser std along their plane below a share of the greater).
-_SCENE_QUANTILE, _SCENE_QUANTILE_STD, _SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.5
+_SCENE_QUANTILE, _SCENE_QUANTILE_STD, SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.5
 # It is not the noise where that is as large as the neighbourhood: the nearest of a thick slab fill a ball.
 _SEEN_UP_TO_RADII, _UNSEEN_FROM_RADII = 0.05, 0.1
 _LEAST_LEVERAGE_LEFT = 0.1  # of a point's residual, what the fit to itself has left
@@ -85,17 +85,16 @@ def low_noise_weight(ratios: Floats) -> float:
     return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
 
-def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
+def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
     """Return a step (n, 3), less of it where it is more than the noise.
 
-    low_noise: as of `low_noise_weight`; patch: (P, 3) points, of which the first n >= 1 make the step. Of moves m
-    across the surface, with noise n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is
-    independent of the noise.
+    low_noise: as of `low_noise_weight`; nearest: 16 or more of each of the n >= 1 points. Of moves m across the
+    surface, with noise n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent
+    of the noise.
     """
-    points = patch[: len(step)]
-    here = _surfaces(neighbourhoods(points, patch, _FIT_NEIGHBOURS))
+    here = _surfaces(nearest.first(_FIT_NEIGHBOURS))
     rise = (step * here.normals).sum(axis=1)
-    place = _places(points)
+    place = _places(nearest)
     noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
     moves = np.square(rise)[place].mean(axis=1)
     weight = _wiener(noise, moves)
@@ -105,22 +104,21 @@ def wiener_weighted(step: Floats, patch: Floats, low_noise: float) -> Floats:
     return less
 
 
-def limited_to_surfaces(step: Floats, patch: Floats) -> Floats:
+def limited_to_surfaces(step: Floats, nearest: Nearest) -> Floats:
     """Return a scene's step (n, 3), less of it where it is more than what surfaces through few neighbours leave.
 
-    patch: (P, 3) points, of which the first n >= 1 make the step. Where points are few beside what was scanned, edges
-    and kerbs are noise to a patch of 1000. Weights are Wiener's, as of `wiener_weighted`.
+    nearest: 32 of each of the n >= 1 points. Where points are few beside what was scanned, edges and kerbs are noise to
+    a patch of 1000. Weights are Wiener's, as of `wiener_weighted`.
     """
-    points = patch[: len(step)]
-    near = Nearest.of(points, patch, _SCENE_NEIGHBOURS).in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
+    near = nearest.in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
     stds = _surfaces(near).stds
     _, less, most = np.sqrt(np.maximum(near.variances, 0.0)).T
     tells = less > _LINE_RATIO * most
-    place = _places(points)
+    place = _places(nearest)
     counts = tells[place].sum(axis=1)
     rising = np.sort(np.where(tells, stds, np.inf)[place], axis=1)
     lowest = (_SCENE_QUANTILE * np.maximum(counts - 1, 0)).astype(np.int64)
-    noise = rising[np.arange(len(points)), lowest] / _SCENE_QUANTILE_STD
+    noise = rising[np.arange(len(step)), lowest] / _SCENE_QUANTILE_STD
     noise[2 * counts <= place.shape[1]] = np.inf
     in_radii = noise / near.radii[place].mean(axis=1)
     known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
@@ -129,8 +127,9 @@ def limited_to_surfaces(step: Floats, patch: Floats) -> Floats:
     return less_of_it
 
 
-def _places(points: Floats) -> npt.NDArray[np.int64]:
-    """Return the rows of the points near each of (n, 3) whose noise is read as one: (n, 80), or all of them."""
+def _places(nearest: Nearest) -> npt.NDArray[np.int64]:
+    """Return the rows of the points near each of n whose noise is read as one: (n, 80), or all of them."""
+    points = nearest.points[:, 0]
     place: npt.NDArray[np.int64]
     _, place = cKDTree(points).query(points, k=np.arange(1, min(_NOISE_NEIGHBOURS, len(points)) + 1))
     return place

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.low_noise import limited_to_surfaces, wiener_weighted
-from straightpcf.model.neighbourhoods import Neighbourhoods, neighbourhoods
+from straightpcf.model.low_noise import SCENE_NEIGHBOURS, limited_to_surfaces, wiener_weighted
+from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
 
@@ -56,30 +56,43 @@ def restrained_step(
     *,
     sampling: Sampling,
     trusted_noise: float | None,
+    height_axis: int | None = None,
 ) -> tuple[npt.NDArray[np.float64], bool]:
     """Return what is made of a step (n, 3), and whether it would have joined walls.
 
     moved: (n, 3), by the passes before; patch: (P, 3) points, of which the first n make the step; sampling: of the
-    cloud; trusted_noise: the noise std that is believed of a scene's patch (`trusted_noise_stds`), None of an object's.
+    cloud; trusted_noise: the noise std that is believed of a scene's patch (`trusted_noise_stds`), None of an object's;
+    height_axis: that of a raster's heights, which alone move.
     """
     if len(step) == 0:
         return step, False
+    scene, irregular, low_noise = trusted_noise is not None, sampling.irregular, sampling.low_noise
+    if not (scene or irregular or low_noise > 0):
+        return _between_walls(step, patch, sampling)
+    nearest = Nearest.of(patch[: len(step)], patch, SCENE_NEIGHBOURS if scene else _PLANE_NEIGHBOURS)
     if trusted_noise is not None:
-        near = neighbourhoods(patch[: len(step)], patch, _FEW_NEIGHBOURS)
+        near = nearest.first(_FEW_NEIGHBOURS)
         step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch, near)
         step = held_where_scattered(step, near, trusted_noise)
-    share = 1.0
-    if sampling.thin_walls:
-        share = share_between_walls(step, patch, uncovered=sampling.uncovered, by_chance=sampling.irregular)
-    if share < 1:
-        step = share * step
-    if sampling.irregular:
-        step = without_tangential_motion(step, patch)
-    if sampling.low_noise > 0:
-        step = wiener_weighted(step, patch, sampling.low_noise)
-    if trusted_noise is not None:
-        step = limited_to_surfaces(step, patch)
-    return step, share < _HELD_BACK_SHARE
+    step, held_back = _between_walls(step, patch, sampling)
+    if irregular:
+        step = without_tangential_motion(step, nearest)
+    if low_noise > 0:
+        step = wiener_weighted(step, nearest, low_noise)
+    if height_axis is not None:
+        step = along_heights(step, nearest, height_axis)
+    elif scene:
+        step = limited_to_surfaces(step, nearest)
+    return step, held_back
+
+
+def _between_walls(
+    step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64], sampling: Sampling
+) -> tuple[npt.NDArray[np.float64], bool]:
+    if not sampling.thin_walls:
+        return step, False
+    share = share_between_walls(step, patch, uncovered=sampling.uncovered, by_chance=sampling.irregular)
+    return (share * step if share < 1 else step), share < _HELD_BACK_SHARE
 
 
 def trusted_noise_stds(
@@ -149,13 +162,13 @@ def held_where_scattered(
     return out
 
 
-def along_heights(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64], axis: int) -> npt.NDArray[np.float64]:
+def along_heights(step: npt.NDArray[np.float64], nearest: Nearest, axis: int) -> npt.NDArray[np.float64]:
     """Return steps (n, 3) along an axis alone, to where those that are asked for would take the surface.
 
-    patch: (P, 3) points of a raster, of which the first n make the step; axis: that of their heights. Where the surface
-    is steep, what the step has along the axis.
+    nearest: those of the n points, of a raster; axis: that of its heights. Where the surface is steep, what the step
+    has along the axis.
     """
-    near = neighbourhoods(patch[: len(step)], patch, _PLANE_NEIGHBOURS)
+    near = nearest.first(_PLANE_NEIGHBOURS)
     upright = near.normals[:, axis]
     steep = np.abs(upright) < _STEEP
     height = np.where(steep, step[:, axis], (step * near.normals).sum(axis=1) / np.where(steep, 1.0, upright))
@@ -164,14 +177,14 @@ def along_heights(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64],
     return out
 
 
-def without_tangential_motion(step: npt.NDArray[np.float64], patch: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def without_tangential_motion(step: npt.NDArray[np.float64], nearest: Nearest) -> npt.NDArray[np.float64]:
     """Return a step (n, 3) without what goes along the surface, where there is one.
 
-    patch: (P, 3) points, of which the first n make the step. Points that lie evenly are spread so again (`spread`);
-    others lie as beams or chance have it (`Sampling.irregular`): to draw them together widens gaps and tears scan
-    lines, and to spread them takes them away from where they were.
+    nearest: those of the n points. Points that lie evenly are spread so again (`spread`); others lie as beams or chance
+    have it (`Sampling.irregular`): to draw them together widens gaps and tears scan lines, and to spread them takes
+    them away from where they were.
     """
-    near = neighbourhoods(patch[: len(step)], patch, _PLANE_NEIGHBOURS)
+    near = nearest.first(_PLANE_NEIGHBOURS)
     least, less, most = np.sqrt(np.maximum(near.variances, 1e-300)).T
     plane = np.clip((_VOLUME_RATIO - least / less) / (_VOLUME_RATIO - _PLANE_RATIO), 0, 1)
     plane *= np.clip(less / most / _LINE_RATIO - 1, 0, 1)

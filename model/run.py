@@ -18,7 +18,7 @@ from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated, without_data
 from straightpcf.model.patches import Patches
-from straightpcf.model.restraint import along_heights, restrained_step, trusted_noise_stds
+from straightpcf.model.restraint import restrained_step, trusted_noise_stds
 from straightpcf.model.spread import ROUNDS
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
@@ -313,9 +313,9 @@ class Run:
             return owned, step, False
         limit = None if trusted_noise is None else trusted_noise[patch]
         moved, around = self.moved[owned], positions.take(cut.index[patch], axis=0)
-        step, held_back = restrained_step(step, moved, around, sampling=reading.sampling, trusted_noise=limit)
-        if reading.height_axis is not None:
-            step = along_heights(step, around, reading.height_axis)
+        step, held_back = restrained_step(
+            step, moved, around, sampling=reading.sampling, trusted_noise=limit, height_axis=reading.height_axis
+        )
         return owned, step, held_back
 
     def _cuts(

@@ -11,6 +11,7 @@ from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
 from tests.clouds import even_sphere, noisy, sphere, torus
+from tests.model.neighbours import nearest
 
 
 def quiet(xyz: np.ndarray) -> float:
@@ -31,7 +32,7 @@ def test_as_few_points_as_are_filtered_and_points_in_a_line_are_no_error() -> No
     for xyz in (sphere(33), line):
         step = np.full((20, 3), 0.1)
         assert 0 <= quiet(xyz) <= 1
-        assert np.isfinite(wiener_weighted(step, xyz, 1.0)).all()
+        assert np.isfinite(wiener_weighted(step, nearest(step, xyz), 1.0)).all()
 
 
 def test_a_step_across_is_made_smaller_by_wieners_weight() -> None:
@@ -39,12 +40,12 @@ def test_a_step_across_is_made_smaller_by_wieners_weight() -> None:
     noise, around = 0.001, np.column_stack([rng.uniform(-1, 1, (1000, 2)), 0.001 * rng.standard_normal(1000)])
     around = around[np.argsort((around**2).sum(axis=1))]
     asked = np.column_stack([np.zeros((300, 2)), 4 * noise * rng.standard_normal(300)])
-    made = wiener_weighted(asked, around, 1.0)
+    made = wiener_weighted(asked, nearest(asked, around), 1.0)
     share = np.linalg.norm(made, axis=1) / np.linalg.norm(asked, axis=1)
     assert np.median(share) == pytest.approx(1 / 16, rel=0.5)
-    np.testing.assert_array_equal(wiener_weighted(asked, around, 0.0), asked)
+    np.testing.assert_array_equal(wiener_weighted(asked, nearest(asked, around), 0.0), asked)
     small = np.column_stack([np.zeros((300, 2)), -0.5 * around[:300, 2]])
-    np.testing.assert_array_equal(wiener_weighted(small, around, 1.0), small)
+    np.testing.assert_array_equal(wiener_weighted(small, nearest(small, around), 1.0), small)
 
 
 def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
@@ -54,7 +55,7 @@ def test_a_point_with_more_noise_than_others_goes_all_the_way() -> None:
     around[:300:30, 2] += 0.02
     step = np.column_stack([np.zeros((300, 2)), 0.002 * rng.standard_normal(300)])
     step[::30, 2] = -0.02
-    share = np.linalg.norm(wiener_weighted(step, around, 1.0), axis=1) / np.linalg.norm(step, axis=1)
+    share = np.linalg.norm(wiener_weighted(step, nearest(step, around), 1.0), axis=1) / np.linalg.norm(step, axis=1)
     assert (share[::30] == 1.0).all()
     assert np.median(share) < 0.2
 
@@ -89,10 +90,10 @@ def test_a_scenes_step_is_no_larger_than_the_noise_that_a_few_neighbours_show() 
     around = floor(0.01, 0.3)
     rng = np.random.default_rng(1)
     wrong = rng.standard_normal((300, 3)) * 0.1
-    made = limited_to_surfaces(wrong, around)
+    made = limited_to_surfaces(wrong, nearest(wrong, around))
     assert np.sqrt(np.square(made).sum(axis=1).mean()) < 0.02 < np.sqrt(np.square(wrong).sum(axis=1).mean())
     right = np.column_stack([np.zeros((300, 2)), -around[:300, 2]])
-    assert np.linalg.norm(limited_to_surfaces(right, around)) > 0.8 * np.linalg.norm(right)
+    assert np.linalg.norm(limited_to_surfaces(right, nearest(right, around))) > 0.8 * np.linalg.norm(right)
 
 
 def test_a_scenes_step_stays_where_few_neighbours_do_not_show_its_noise() -> None:
@@ -100,13 +101,13 @@ def test_a_scenes_step_stays_where_few_neighbours_do_not_show_its_noise() -> Non
     for around in (floor(0.02, 0.0, rings=True), floor(0.3, 0.1)):
         height = around[:300, 2] - np.median(around[:, 2])
         right = np.column_stack([np.zeros((300, 2)), -height])
-        assert np.linalg.norm(limited_to_surfaces(right, around)) > 0.8 * np.linalg.norm(right)
+        assert np.linalg.norm(limited_to_surfaces(right, nearest(right, around))) > 0.8 * np.linalg.norm(right)
 
 
 def test_a_scenes_few_points_and_points_in_a_line_are_no_error() -> None:
     line = np.linspace(0, 1, 400)[:, None] * [1.0, 2.0, 3.0]
     for xyz in (sphere(33), line, np.zeros((40, 3))):
         step = np.full((20, 3), 0.1)
-        assert np.isfinite(limited_to_surfaces(step, xyz)).all()
-    np.testing.assert_array_equal(limited_to_surfaces(np.full((20, 3), 0.1), line), np.full((20, 3), 0.1))
-    assert len(limited_to_surfaces(np.full((1, 3), 0.1), line)) == 1
+        assert np.isfinite(limited_to_surfaces(step, nearest(step, xyz))).all()
+    np.testing.assert_array_equal(limited_to_surfaces(step, nearest(step, line)), step)
+    assert len(limited_to_surfaces(step[:1], nearest(step[:1], line))) == 1

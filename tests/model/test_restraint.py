@@ -14,6 +14,7 @@ from straightpcf.model.restraint import (
     held_to_lines,
     held_where_scattered,
     limited_to_noise,
+    restrained_step,
     trusted_noise_stds,
     without_tangential_motion,
 )
@@ -21,6 +22,7 @@ from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, far_group, noisy, torus
+from tests.model.neighbours import nearest
 
 
 def one_patch(count: int) -> Patches:
@@ -56,7 +58,7 @@ def test_nothing_goes_along_a_surface_and_all_across_it() -> None:
     rng = np.random.default_rng(0)
     sheet = rng.uniform(-1, 1, (500, 3)) * [1, 1, 0] + [0, 0, 1] * (0.01 * rng.standard_normal((500, 1)))
     step = rng.normal(0, 0.01, (200, 3))
-    left = without_tangential_motion(step, sheet)
+    left = without_tangential_motion(step, nearest(step, sheet))
     np.testing.assert_allclose(left[:, 2], step[:, 2], atol=0.3 * 0.01)
     assert np.abs(left[:, :2]).max() < 0.3 * np.abs(step[:, :2]).max()
 
@@ -64,12 +66,10 @@ def test_nothing_goes_along_a_surface_and_all_across_it() -> None:
 def test_where_there_is_no_surface_a_step_stays_as_it_is() -> None:
     rng = np.random.default_rng(0)
     step = rng.normal(0, 0.01, (200, 3))
-    inside = np.linalg.norm(without_tangential_motion(step, rng.standard_normal((1000, 3))), axis=1) / np.linalg.norm(
-        step, axis=1
-    )
-    assert np.median(inside) == 1.0
-    np.testing.assert_array_equal(without_tangential_motion(step, np.zeros((300, 3))), step)
-    assert without_tangential_motion(step[:0], sheet_of(300)).shape == (0, 3)
+    left = without_tangential_motion(step, nearest(step, rng.standard_normal((1000, 3))))
+    assert np.median(np.linalg.norm(left, axis=1) / np.linalg.norm(step, axis=1)) == 1.0
+    np.testing.assert_array_equal(without_tangential_motion(step, nearest(step, np.zeros((300, 3)))), step)
+    assert without_tangential_motion(step[:0], nearest(step[:0], sheet_of(300))).shape == (0, 3)
 
 
 def of_first(count: int, patch: np.ndarray) -> Neighbourhoods:
@@ -98,10 +98,22 @@ def test_a_rasters_step_across_a_slope_becomes_one_of_its_heights() -> None:
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(20.0), np.arange(20.0)))
     slope = np.column_stack([x, y, 0.5 * x])
     across = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
-    step = along_heights(np.array([0.2 * across, [1.0, 0, 0.5], [0, 0, 0.3]]), slope, 2)
+    asked = np.array([0.2 * across, [1.0, 0, 0.5], [0, 0, 0.3]])
+    step = along_heights(asked, nearest(asked, slope), 2)
     np.testing.assert_allclose(step, [[0, 0, 0.2 * np.sqrt(1.25)], [0, 0, 0], [0, 0, 0.3]], atol=1e-9)
     cliff = slope * [0.1, 1, 10]
-    np.testing.assert_allclose(along_heights(np.array([[0.3, 0, 0.1]]), cliff, 2), [[0, 0, 0.1]])
+    step = np.array([[0.3, 0, 0.1]])
+    np.testing.assert_allclose(along_heights(step, nearest(step, cliff), 2), [[0, 0, 0.1]])
+
+
+def test_a_rasters_heights_go_farther_than_a_few_neighbours_show_noise() -> None:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(20.0), np.arange(20.0)))
+    hill, step = np.column_stack([x, y, 0.002 * x * x]), np.array([[0.0, 0, 0.5]])
+    of = {"sampling": Sampling(irregular=True), "trusted_noise": 1.0}
+    restrained, _ = restrained_step(step, np.zeros((1, 3)), hill, **of)
+    assert np.linalg.norm(restrained) < 0.1 * np.linalg.norm(step)
+    restrained, _ = restrained_step(step, np.zeros((1, 3)), hill, **of, height_axis=2)
+    np.testing.assert_allclose(restrained, step, rtol=0.05)
 
 
 def test_what_is_no_line_is_not_held_to_one() -> None:
