@@ -16,7 +16,14 @@ from scipy.spatial import cKDTree
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["SCENE_NEIGHBOURS", "NeighbourhoodNoise", "limited_to_surfaces", "low_noise_weight", "wiener_weighted"]
+__all__ = [
+    "SCENE_NEIGHBOURS",
+    "NeighbourhoodNoise",
+    "limited_to_surfaces",
+    "low_noise_weight",
+    "noise_on_surfaces",
+    "wiener_weighted",
+]
 
 Floats = npt.NDArray[np.float64]
 
@@ -104,27 +111,46 @@ def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
     return less
 
 
-def limited_to_surfaces(step: Floats, nearest: Nearest) -> Floats:
+def limited_to_surfaces(step: Floats, nearest: Nearest, most: float = np.inf) -> Floats:
     """Return a scene's step (n, 3), less of it where it is more than what surfaces through few neighbours leave.
 
-    nearest: 32 of each of the n >= 1 points. Where points are few beside what was scanned, edges and kerbs are noise to
-    a patch of 1000. Weights are Wiener's, as of `wiener_weighted`.
+    nearest: 32 of each of the n >= 1 points; most: the noise std that is believed of any place. Where points are few
+    beside what was scanned, edges and kerbs are noise to a patch of 1000. Weights are Wiener's, as of
+    `wiener_weighted`.
     """
-    near = nearest.in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
-    stds = _surfaces(near).stds
-    _, less, most = np.sqrt(np.maximum(near.variances, 0.0)).T
-    tells = less > _LINE_RATIO * most
-    place = _places(nearest)
-    counts = tells[place].sum(axis=1)
-    rising = np.sort(np.where(tells, stds, np.inf)[place], axis=1)
-    lowest = (_SCENE_QUANTILE * np.maximum(counts - 1, 0)).astype(np.int64)
-    noise = rising[np.arange(len(step)), lowest] / _SCENE_QUANTILE_STD
-    noise[2 * counts <= place.shape[1]] = np.inf
+    near, place = _around(nearest), _places(nearest)
+    noise = _noise_of_places(near, place)
     in_radii = noise / near.radii[place].mean(axis=1)
     known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
     moves = np.square(step).sum(axis=1)[place].mean(axis=1)
-    less_of_it: Floats = step * (1.0 - known * (1.0 - _wiener(noise, moves)))[:, None]
+    less_of_it: Floats = step * (1.0 - known * (1.0 - _wiener(np.minimum(noise, most), moves)))[:, None]
     return less_of_it
+
+
+def noise_on_surfaces(nearest: Nearest, patches: int) -> Floats:
+    """Return what surfaces through few neighbours leave of a scene's points: (M,), infinite where they tell nothing.
+
+    nearest: 32 or more of some points, as many of each of the M patches, patch after patch.
+    """
+    distances, points = (on_host(array[:, :SCENE_NEIGHBOURS]) for array in (nearest.distances, nearest.points))
+    return _noise_of_places(_around(Nearest(distances, points)), np.arange(len(points)).reshape(patches, -1))
+
+
+def _around(nearest: Nearest) -> Neighbourhoods:
+    return nearest.in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
+
+
+def _noise_of_places(near: Neighbourhoods, place: npt.NDArray[np.int64]) -> Floats:
+    """Return the noise std of places of a scene, (m,): of some rows each, (m, k); infinite where these tell nothing."""
+    stds = _surfaces(near).stds
+    _, less, most = np.sqrt(np.maximum(near.variances, 0.0)).T
+    tells = less > _LINE_RATIO * most
+    counts = tells[place].sum(axis=1)
+    rising = np.sort(np.where(tells, stds, np.inf)[place], axis=1)
+    lowest = (_SCENE_QUANTILE * np.maximum(counts - 1, 0)).astype(np.int64)
+    noise: Floats = rising[np.arange(len(place)), lowest] / _SCENE_QUANTILE_STD
+    noise[2 * counts <= place.shape[1]] = np.inf
+    return noise
 
 
 def _places(nearest: Nearest) -> npt.NDArray[np.int64]:

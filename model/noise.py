@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from straightpcf.model.arrays import on_host
 from straightpcf.model.calibration import DENSE_FROM_RADII, Calibration
+from straightpcf.model.low_noise import noise_on_surfaces
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import (
     HIGH_NOISE,
@@ -50,6 +51,8 @@ _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is belie
 # Where half of a scene's points have their nearest in a plane (std across it below a share of the lesser one along it,
 # and that above one of the greater: no line), no more noise is believed than twice what four fifths of these show.
 _SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
+# Of what surfaces leave of half of a scene's points: more is not believed of any place by its surfaces.
+_MOST_ON_SURFACES_RATIO = 3.0
 _EXACT_PLANE_RATIO = 1e-3  # below it a plane is drawn, not scanned: of the noise beside it it says nothing
 _PLANE_FREEDOM = 3  # that a plane takes of its points
 _THICKNESS_NEIGHBOURS = 12
@@ -67,7 +70,8 @@ class Reading:
     object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
     patches, before the first pass (a scene's are shown in sizes of their own, and d says as much); known_distances:
     what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
-    scene's points have, or less; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
+    scene's points have, or less; most_on_surfaces: what is believed of any place of a scene by a few neighbours, before
+    the first pass; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
     raster, None of any other cloud; probes: the patches that were read; thickness: of the surface that a pass has left
     of dense points, the median of the std of each point's nearest across their plane by the lesser one along it.
@@ -82,6 +86,7 @@ class Reading:
     noise_in_radii: float = 0.0
     known_distances: Mapping[int, float] = field(default_factory=dict)
     noise_of_most: float = 0.0
+    most_on_surfaces: float = np.inf
     high_noise: bool = False
     uneven: bool = False
     height_axis: int | None = None
@@ -245,12 +250,14 @@ class NoiseReader:
         raster = axis is not None
         shown = self.of_scene(positions, probes, raster=raster)
         parts: tuple[int, ...] = (1,)
+        most_on_surfaces = np.inf
         noise, noise_of_most = self._noise_of_scene(shown, probes)
         if not np.isfinite(noise_of_most) and first and self._zoom:
             noise, noise_of_most = self._reread_scene(positions, tiling, noise, raster=raster)
             parts = parts_of(noise, probes.radii, len(positions))
         if first and self._zoom and not raster:
             noise_of_most = min(noise_of_most, self._most_seen(positions, probes))
+            most_on_surfaces = self._most_on_surfaces(positions, probes)
         distance = float(np.median(shown.usual_distances))
         return Reading(
             distance,
@@ -259,6 +266,7 @@ class NoiseReader:
             Sampling(irregular=True),
             parts=parts,
             noise_of_most=noise_of_most,
+            most_on_surfaces=most_on_surfaces,
             height_axis=axis,
             probes=probes,
         )
@@ -272,6 +280,11 @@ class NoiseReader:
         if are_planes.mean() < _SEEN_SHARE:
             return np.inf
         return _SEEN_RATIO * float(np.quantile(stds[are_planes], _MOST_POINTS_SHARE))
+
+    def _most_on_surfaces(self, positions: Floats, probes: Patches) -> float:
+        """Return how much noise is believed of any place of a scene by the few neighbours of points."""
+        stds = np.concatenate(list(self._processor.survey(positions, probes, noise_on_surfaces)))
+        return _MOST_ON_SURFACES_RATIO * _quantile(stds, probes.owned, 0.5)
 
     def noise_left(self, positions: Floats, first: Reading, probes: Patches) -> float:
         """Return the noise std of half of a scene's points after all passes, where it was read before: in `probes`.

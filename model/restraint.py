@@ -56,13 +56,14 @@ def restrained_step(
     *,
     sampling: Sampling,
     trusted_noise: float | None,
+    most_on_surfaces: float = np.inf,
     height_axis: int | None = None,
 ) -> tuple[npt.NDArray[np.float64], bool]:
     """Return what is made of a step (n, 3), and whether it would have joined walls.
 
     moved: (n, 3), by the passes before; patch: (P, 3) points, of which the first n make the step; sampling: of the
     cloud; trusted_noise: the noise std that is believed of a scene's patch (`trusted_noise_stds`), None of an object's;
-    height_axis: that of a raster's heights, which alone move.
+    most_on_surfaces: as of a scene's Reading; height_axis: that of a raster's heights, which alone move.
     """
     if len(step) == 0:
         return step, False
@@ -82,7 +83,7 @@ def restrained_step(
     if height_axis is not None:
         step = along_heights(step, nearest, height_axis)
     elif scene:
-        step = limited_to_surfaces(step, nearest)
+        step = limited_to_surfaces(step, nearest, most_on_surfaces)
     return step, held_back
 
 

@@ -314,7 +314,13 @@ class Run:
         limit = None if trusted_noise is None else trusted_noise[patch]
         moved, around = self.moved[owned], positions.take(cut.index[patch], axis=0)
         step, held_back = restrained_step(
-            step, moved, around, sampling=reading.sampling, trusted_noise=limit, height_axis=reading.height_axis
+            step,
+            moved,
+            around,
+            sampling=reading.sampling,
+            trusted_noise=limit,
+            most_on_surfaces=self.readings[0].most_on_surfaces,
+            height_axis=reading.height_axis,
         )
         return owned, step, held_back
 

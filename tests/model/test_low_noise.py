@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from straightpcf.model.filter import load_filter
-from straightpcf.model.low_noise import limited_to_surfaces, wiener_weighted
+from straightpcf.model.low_noise import limited_to_surfaces, noise_on_surfaces, wiener_weighted
 from straightpcf.model.metrics import chamfer_distance
+from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
 from tests.clouds import even_sphere, noisy, sphere, torus
@@ -102,6 +103,19 @@ def test_a_scenes_step_stays_where_few_neighbours_do_not_show_its_noise() -> Non
         height = around[:300, 2] - np.median(around[:, 2])
         right = np.column_stack([np.zeros((300, 2)), -height])
         assert np.linalg.norm(limited_to_surfaces(right, nearest(right, around))) > 0.8 * np.linalg.norm(right)
+
+
+def test_far_places_of_few_points_are_not_believed_to_have_more_noise_than_the_rest() -> None:
+    around = floor(0.01, 0.3)
+    step = np.random.default_rng(1).standard_normal((300, 3)) * 0.1
+    free, held = (limited_to_surfaces(step, nearest(step, around), most) for most in (np.inf, 0.001))
+    assert np.sqrt(np.square(held).sum(axis=1).mean()) < 0.0001 < np.sqrt(np.square(free).sum(axis=1).mean())
+    asked = nearest(np.zeros((200, 3)), around)
+    two = Nearest.joined([asked, nearest(np.zeros((200, 3)), 3 * around)])
+    near, far = noise_on_surfaces(two, 2)
+    assert far == pytest.approx(3 * near)
+    assert 0.005 < near < 0.02
+    assert noise_on_surfaces(nearest(np.zeros((50, 3)), np.linspace(0, 1, 400)[:, None] * [1.0, 2, 3]), 1) == np.inf
 
 
 def test_a_scenes_few_points_and_points_in_a_line_are_no_error() -> None:
