@@ -22,6 +22,7 @@ __all__ = [
     "limited_to_surfaces",
     "low_noise_weight",
     "noise_on_surfaces",
+    "wiener_share",
     "wiener_weighted",
 ]
 
@@ -104,7 +105,7 @@ def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
     place = _places(nearest)
     noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
     moves = np.square(rise)[place].mean(axis=1)
-    weight = _wiener(noise, moves)
+    weight = wiener_share(noise**2, moves)
     own = here.own_residuals
     out = (np.abs(own) > _OUTLIER_STDS * noise) & (-rise * own > _OUTLIER_STEP_SHARE * own**2)
     less: Floats = step * np.where(out, 1.0, 1.0 - low_noise * (1.0 - weight))[:, None]
@@ -123,7 +124,7 @@ def limited_to_surfaces(step: Floats, nearest: Nearest, most: float = np.inf) ->
     in_radii = noise / near.radii[place].mean(axis=1)
     known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
     moves = np.square(step).sum(axis=1)[place].mean(axis=1)
-    less_of_it: Floats = step * (1.0 - known * (1.0 - _wiener(np.minimum(noise, most), moves)))[:, None]
+    less_of_it: Floats = step * (1.0 - known * (1.0 - wiener_share(np.minimum(noise, most) ** 2, moves)))[:, None]
     return less_of_it
 
 
@@ -161,10 +162,10 @@ def _places(nearest: Nearest) -> npt.NDArray[np.int64]:
     return place
 
 
-def _wiener(noise: Floats, moves: Floats) -> Floats:
-    """Return the share, 1 at most, that is made of moves of a mean square (n,) among noise of a std (n,)."""
-    weight: Floats = np.minimum(1.0, noise**2 / np.maximum(moves, np.finfo(np.float64).tiny))
-    return weight
+def wiener_share(noise_variances: Floats, moves: Floats) -> Floats:
+    """Return the share (n,), 1 at most, that is made of moves of a mean square (n,) among noise of a variance (n,)."""
+    share: Floats = np.minimum(1.0, noise_variances / np.maximum(moves, np.finfo(np.float64).tiny))
+    return share
 
 
 def _surfaces(near: Neighbourhoods) -> _Surfaces:

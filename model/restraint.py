@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.low_noise import SCENE_NEIGHBOURS, limited_to_surfaces, wiener_weighted
+from straightpcf.model.low_noise import SCENE_NEIGHBOURS, limited_to_surfaces, wiener_share, wiener_weighted
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
@@ -144,7 +144,7 @@ def held_to_lines(
     points = patch[: len(step)]
     _, beside = cKDTree(points).query(points, k=np.arange(1, min(_FEW_NEIGHBOURS, len(points)) + 1))
     moves = np.square(off).sum(axis=1)[beside].mean(axis=1)
-    kept = in_line * (1 - np.minimum(1.0, noise / np.maximum(moves, 1e-300)))
+    kept = in_line * (1 - wiener_share(noise, moves))
     out: npt.NDArray[np.float64] = step - off * kept[:, None]
     return out
 
