@@ -17,6 +17,7 @@ from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, surface_terms
 
 __all__ = [
+    "EXACT_PLANE_RATIO",
     "SCENE_NEIGHBOURS",
     "NeighbourhoodNoise",
     "limited_to_surfaces",
@@ -42,8 +43,10 @@ _OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
 # where all are of one plane (the std of so few heights, chi of 10 degrees of freedom). Each is fitted to 16 of so many
 # nearest; those of lines tell nothing (the lesser std along their plane below a share of the greater).
 _SCENE_QUANTILE, _SCENE_QUANTILE_STD, SCENE_NEIGHBOURS, _LINE_RATIO = 0.1, 0.7, 32, 0.5
-# It is not the noise where that is as large as the neighbourhood: the nearest of a thick slab fill a ball.
-_SEEN_UP_TO_RADII, _UNSEEN_FROM_RADII = 0.05, 0.1
+# It is not the noise where that is as large as the neighbourhood: the nearest of a thick slab fill a ball. So many
+# times what is believed of any place is no slab's thickness: there it is how rough the place is.
+_SEEN_UP_TO_RADII, _UNSEEN_FROM_RADII, _THICKEST_RATIO = 0.05, 0.1, 4.0
+EXACT_PLANE_RATIO = 1e-3  # of its width: below it a plane is drawn, not scanned: of the noise beside it it says nothing
 _LEAST_LEVERAGE_LEFT = 0.1  # of a point's residual, what the fit to itself has left
 
 
@@ -121,7 +124,7 @@ def limited_to_surfaces(step: Floats, nearest: Nearest, most: float = np.inf) ->
     """
     near, place = _around(nearest), _places(nearest)
     noise = _noise_of_places(near, place)
-    in_radii = noise / near.radii[place].mean(axis=1)
+    in_radii = np.minimum(noise, _THICKEST_RATIO * most) / near.radii[place].mean(axis=1)
     known = np.clip((_UNSEEN_FROM_RADII - in_radii) / (_UNSEEN_FROM_RADII - _SEEN_UP_TO_RADII), 0.0, 1.0)
     moves = np.square(step).sum(axis=1)[place].mean(axis=1)
     less_of_it: Floats = step * (1.0 - known * (1.0 - wiener_share(np.minimum(noise, most) ** 2, moves)))[:, None]
@@ -134,7 +137,10 @@ def noise_on_surfaces(nearest: Nearest, patches: int) -> Floats:
     nearest: 32 or more of some points, as many of each of the M patches, patch after patch.
     """
     distances, points = (on_host(array[:, :SCENE_NEIGHBOURS]) for array in (nearest.distances, nearest.points))
-    return _noise_of_places(_around(Nearest(distances, points)), np.arange(len(points)).reshape(patches, -1))
+    near, place = _around(Nearest(distances, points)), np.arange(len(points)).reshape(patches, -1)
+    noise = _noise_of_places(near, place)
+    noise[noise < EXACT_PLANE_RATIO * near.radii[place].mean(axis=1)] = np.inf
+    return noise
 
 
 def _around(nearest: Nearest) -> Neighbourhoods:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from straightpcf.model.arrays import on_host
 from straightpcf.model.calibration import DENSE_FROM_RADII, Calibration
-from straightpcf.model.low_noise import noise_on_surfaces
+from straightpcf.model.low_noise import EXACT_PLANE_RATIO, noise_on_surfaces
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import (
     HIGH_NOISE,
@@ -53,7 +53,6 @@ _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is belie
 _SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
 # Of what surfaces leave of half of a scene's points: more is not believed of any place by its surfaces.
 _MOST_ON_SURFACES_RATIO = 3.0
-_EXACT_PLANE_RATIO = 1e-3  # below it a plane is drawn, not scanned: of the noise beside it it says nothing
 _PLANE_FREEDOM = 3  # that a plane takes of its points
 _THICKNESS_NEIGHBOURS = 12
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
@@ -346,7 +345,7 @@ def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.boo
     """Return the std of each point's neighbours across their plane, and whether that tells noise: (n,) each."""
     near = nearest.first(_SEEN_NEIGHBOURS)
     least, less, most = np.sqrt(np.maximum(on_host(near.variances), 0.0) / (near.local.shape[1] - _PLANE_FREEDOM)).T
-    is_plane = (least > _EXACT_PLANE_RATIO * less) & (least < _SEEN_PLANE_RATIO * less)
+    is_plane = (least > EXACT_PLANE_RATIO * less) & (least < _SEEN_PLANE_RATIO * less)
     return least, is_plane & (less > _SEEN_LINE_RATIO * most)
 
 

@@ -105,6 +105,17 @@ def test_a_scenes_step_stays_where_few_neighbours_do_not_show_its_noise() -> Non
         assert np.linalg.norm(limited_to_surfaces(right, nearest(right, around))) > 0.8 * np.linalg.norm(right)
 
 
+def test_a_rough_place_whose_neighbourhoods_are_wide_beside_the_noise_is_not_noisy() -> None:
+    around = floor(0.3, 0.1)
+    step = np.column_stack([np.zeros((300, 2)), -around[:300, 2]])
+    near = nearest(step, around)
+    np.testing.assert_array_equal(limited_to_surfaces(step, near, 0.1), step)
+    assert np.sqrt(np.square(limited_to_surfaces(step, near, 0.002)).sum(axis=1).mean()) < 1e-4
+    line = np.linspace(0, 1, 400)[:, None] * [1.0, 2.0, 3.0]
+    step = np.full((20, 3), 0.1)
+    assert (np.linalg.norm(limited_to_surfaces(step, nearest(step, line), 1e-6), axis=1) < 1e-9).all()
+
+
 def test_far_places_of_few_points_are_not_believed_to_have_more_noise_than_the_rest() -> None:
     around = floor(0.01, 0.3)
     step = np.random.default_rng(1).standard_normal((300, 3)) * 0.1
@@ -115,6 +126,7 @@ def test_far_places_of_few_points_are_not_believed_to_have_more_noise_than_the_r
     near, far = noise_on_surfaces(two, 2)
     assert far == pytest.approx(3 * near)
     assert 0.005 < near < 0.02
+    assert noise_on_surfaces(nearest(np.zeros((200, 3)), floor(1e-5, 0.3)), 1) == np.inf  # drawn, not scanned
     assert noise_on_surfaces(nearest(np.zeros((50, 3)), np.linspace(0, 1, 400)[:, None] * [1.0, 2, 3]), 1) == np.inf
 
 
