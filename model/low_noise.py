@@ -79,7 +79,16 @@ class NeighbourhoodNoise:
     @classmethod
     def of(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
         """Look at the nearest points of some, as many of each patch, patch after patch."""
-        here = _surfaces(near.first(_FIT_NEIGHBOURS))
+        return cls._on(near.first(_FIT_NEIGHBOURS), patches)
+
+    @classmethod
+    def of_lines(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
+        """Do the same where points lie in lines: the nearest of most are of one, which is in the plane of its beams."""
+        return cls._on(_around(near), patches)
+
+    @classmethod
+    def _on(cls, near: Neighbourhoods, patches: int) -> NeighbourhoodNoise:
+        here = _surfaces(near)
         left, own, radii = (a.reshape(patches, -1) for a in (here.stds, here.own_residuals, here.radii))
         quantile = namespace(left).quantile
         stds = quantile(left, _NOISE_QUANTILE, 1)
@@ -96,14 +105,14 @@ def low_noise_weight(ratios: Floats) -> float:
     return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
 
-def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
+def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float, *, in_lines: bool = False) -> Floats:
     """Return a step (n, 3), less of it where it is more than the noise.
 
-    low_noise: as of `low_noise_weight`; nearest: 16 or more of each of the n >= 1 points. Of moves m across the
-    surface, with noise n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent
-    of the noise.
+    low_noise: as of `low_noise_weight`; nearest: 16 or more of each of the n >= 1 points; in_lines: whether these lie
+    in lines, where 32 are looked at. Of moves m across the surface, with noise n, a share of n^2 / m^2 leaves least
+    error (Wiener's weight): what else they have is independent of the noise.
     """
-    here = _surfaces(nearest.first(_FIT_NEIGHBOURS))
+    here = _surfaces(_around(nearest) if in_lines else nearest.first(_FIT_NEIGHBOURS))
     rise = (step * here.normals).sum(axis=1)
     place = _places(nearest)
     noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
@@ -136,15 +145,16 @@ def noise_on_surfaces(nearest: Nearest, patches: int) -> Floats:
 
     nearest: 32 or more of some points, as many of each of the M patches, patch after patch.
     """
-    distances, points = (on_host(array[:, :SCENE_NEIGHBOURS]) for array in (nearest.distances, nearest.points))
-    near, place = _around(Nearest(distances, points)), np.arange(len(points)).reshape(patches, -1)
+    near, place = _around(nearest), np.arange(len(nearest.points)).reshape(patches, -1)
     noise = _noise_of_places(near, place)
     noise[noise < EXACT_PLANE_RATIO * near.radii[place].mean(axis=1)] = np.inf
     return noise
 
 
 def _around(nearest: Nearest) -> Neighbourhoods:
-    return nearest.in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
+    """Return those of the nearest that lie in all directions, on the host."""
+    distances, points = (on_host(array[:, :SCENE_NEIGHBOURS]) for array in (nearest.distances, nearest.points))
+    return Nearest(distances, points).in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
 
 
 def _noise_of_places(near: Neighbourhoods, place: npt.NDArray[np.int64]) -> Floats:

@@ -70,7 +70,8 @@ def restrained_step(
     scene, irregular, low_noise = trusted_noise is not None, sampling.irregular, sampling.low_noise
     if not (scene or irregular or low_noise > 0):
         return _between_walls(step, patch, sampling)
-    nearest = Nearest.of(patch[: len(step)], patch, SCENE_NEIGHBOURS if scene else _PLANE_NEIGHBOURS)
+    many = scene or sampling.in_lines
+    nearest = Nearest.of(patch[: len(step)], patch, SCENE_NEIGHBOURS if many else _PLANE_NEIGHBOURS)
     if trusted_noise is not None:
         near = nearest.first(_FEW_NEIGHBOURS)
         step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch, near)
@@ -79,7 +80,7 @@ def restrained_step(
     if irregular:
         step = without_tangential_motion(step, nearest)
     if low_noise > 0:
-        step = wiener_weighted(step, nearest, low_noise)
+        step = wiener_weighted(step, nearest, low_noise, in_lines=sampling.in_lines)
     if height_axis is not None:
         step = along_heights(step, nearest, height_axis)
     elif scene:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from straightpcf.model.arrays import on_host
-from straightpcf.model.low_noise import NeighbourhoodNoise, low_noise_weight
+from straightpcf.model.low_noise import EXACT_PLANE_RATIO, NeighbourhoodNoise, low_noise_weight
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import HIGH_NOISE
 from straightpcf.model.patches import Patches
@@ -46,7 +46,8 @@ _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the neares
 class Sampling:
     """How points lie before a pass; all but thin_walls and uncovered as before the first.
 
-    irregular: on their surface by chance, or in lines, as a scene's do; low_noise: how little noise an object's have
+    irregular: on their surface by chance, or in lines, as a scene's do; in_lines: whether the nearest of most are of
+    one line, in the plane of whose beams they lie whatever their noise; low_noise: how little noise an object's have
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
     hiding_share: of their patches, in which noise may hide such; uncovered: whether a pass has taken most of it, and
     walls that it hid were looked for; noise_of_most: the noise std of most points, where a few have so much more that
@@ -54,6 +55,7 @@ class Sampling:
     """
 
     irregular: bool = False
+    in_lines: bool = False
     low_noise: float = 0.0
     thin_walls: bool = False
     hiding_share: float = 0.0
@@ -72,13 +74,18 @@ class Sampling:
         shares = np.concatenate([s.midway_shares for s in found])
         thin_walls = has_walls(shares)
         areas = np.concatenate([s.areas for s in found])
-        noise = [s.noise for s in found]
+        noise, in_lines = [s.noise for s in found], False
+        if _in_radii(noise) < EXACT_PLANE_RATIO:  # on planes that are drawn, or on those of a scanner's lines
+            of_lines = list(survey(xyz, patches, NeighbourhoodNoise.of_lines))
+            in_lines = _in_radii(of_lines) >= EXACT_PLANE_RATIO
+            noise = of_lines if in_lines else noise
         noise_of_most = _noise_of_most(noise, noise_std)
         noise_std = min(noise_std, noise_of_most)
         enough = patches.index.shape[1] >= _LEAST_PATCH_POINTS
         irregular = enough and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
-        return cls(irregular, low_noise, thin_walls, hiding_share=hiding_share(shares), noise_of_most=noise_of_most)
+        hidden = hiding_share(shares)
+        return cls(irregular, in_lines, low_noise, thin_walls, hiding_share=hidden, noise_of_most=noise_of_most)
 
     def after_pass(self, xyz: Floats, patches: Patches, *, survey: Survey = survey) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
@@ -119,6 +126,10 @@ class _PatchStatistics:
         last = near.distances.shape[1] - 1
         areas = near.distances[:, [1, min(_FEW_NEIGHBOURS, last), min(_MANY_NEIGHBOURS, last)]] ** 2
         return cls(on_host(areas), NeighbourhoodNoise.of(near, patches), midway_shares(near, patches))
+
+
+def _in_radii(found: list[NeighbourhoodNoise]) -> float:
+    return float(np.median(np.concatenate([noise.in_radii for noise in found])))
 
 
 def _noise_of_most(found: list[NeighbourhoodNoise], noise_std: float) -> float:
