@@ -18,10 +18,10 @@ from straightpcf.model.survey import Survey, survey
 __all__ = ["Layers"]
 
 _POINTS_A_LAYER = 50  # at least, as a mean: coordinates that are merely rounded to few digits have as many, too
-# A point is within a layer where so many of its nearest others share its coordinate and fill a plane: those of a
-# profile or of a contour lie in a line. A depth camera's frames have 0.05 to 0.5 of their points there along its axis,
-# and none along the others, as faces of a box have.
-_NEAREST, _SHARING, _FILLED_RATIO = 12, 10, 0.3
+# A point is within a layer where so many of its nearest others share its coordinate and fill a plane, and so do those
+# of more: points of a profile or of a contour lie in a line, which noise in its plane hides from the nearest. A depth
+# camera's frames have 0.05 to 0.5 of their points there along its axis, and none along the others, as faces of a box.
+_NEAREST, _SHARING, _WIDE_RATIO, _WIDE_RATIO_OF_MORE = 12, 10, 0.3, 0.2
 _LAYERED_SHARE, _OTHER_AXES = 0.03, 1 / 3
 _FEWEST_LAYERS = 4  # that have such points
 # How far apart layers are beside the points in them: floors without noise are much nearer to the next coordinate that
@@ -89,7 +89,7 @@ class Layers:
 
 def _layered(near: Nearest, _patches: int) -> tuple[npt.NDArray[np.bool_], Floats, Floats]:
     """Say of points whether they are within a layer along each axis, (n, 3); how far the nearest is, (n,); where."""
-    points, distances = on_host(near.points[:, : _NEAREST + 1]), on_host(near.distances[:, 1])
+    points, distances = on_host(near.points), on_host(near.distances[:, 1])
     layered = np.stack([_fill_plane(points, axis) for axis in range(3)], axis=1)
     return layered, np.maximum(distances, 1e-12), points[:, 0]
 
@@ -97,12 +97,23 @@ def _layered(near: Nearest, _patches: int) -> tuple[npt.NDArray[np.bool_], Float
 def _fill_plane(points: Floats, axis: int) -> npt.NDArray[np.bool_]:
     """Say of points (n, k, 3) whether those that share the first one's coordinate are enough, and in no line: (n,)."""
     sharing = points[:, :, axis] == points[:, :1, axis]
-    count = np.maximum(sharing.sum(axis=1), 1)[:, None]
     across = np.delete(points, axis, axis=2)
-    mean = (across * sharing[:, :, None]).sum(axis=1) / count
-    local = (across - mean[:, None]) * sharing[:, :, None]
+    few = np.s_[:, : _NEAREST + 1]
+    enough = sharing[few].sum(axis=1) > _SHARING
+    wide = _are_wide(across[few], sharing[few], _WIDE_RATIO) & _are_wide(across, sharing, _WIDE_RATIO_OF_MORE)
+    return np.asarray(enough & wide)
+
+
+def _are_wide(across: Floats, these: npt.NDArray[np.bool_], ratio: float) -> npt.NDArray[np.bool_]:
+    """Say of some of points (n, k, 2) in a plane, one or more of each row, whether they lie in no line: (n,).
+
+    ratio: of the lesser of their stds to the greater, which those of a line do not reach.
+    """
+    count = these.sum(axis=1)[:, None]
+    mean = (across * these[:, :, None]).sum(axis=1) / count
+    local = (across - mean[:, None]) * these[:, :, None]
     less, most = np.maximum(np.linalg.eigvalsh(local.swapaxes(1, 2) @ local), 0.0).T
-    return np.asarray((count[:, 0] > _SHARING) & (less > _FILLED_RATIO**2 * most))
+    return np.asarray(less > ratio**2 * most)
 
 
 def _share_beside(points: Floats, axis: int) -> float:

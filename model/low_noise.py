@@ -18,6 +18,8 @@ from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, surface_te
 
 __all__ = [
     "EXACT_PLANE_RATIO",
+    "FIT_NEIGHBOURS",
+    "LINES_NEIGHBOURS",
     "SCENE_NEIGHBOURS",
     "NeighbourhoodNoise",
     "limited_to_surfaces",
@@ -29,7 +31,8 @@ __all__ = [
 
 Floats = npt.NDArray[np.float64]
 
-_FIT_NEIGHBOURS, _FIT_TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
+FIT_NEIGHBOURS, _FIT_TERMS = 16, 6  # points to which a surface is fitted, and its coefficients
+LINES_NEIGHBOURS = 64  # of which those are chosen where the nearest of most points are of one line
 _RIDGE = 1e-9  # points in a line have a surface, too; in units of the neighbourhood's radius
 # The noise of so many points near each other is what a quarter of their surfaces leave, or less: the others have edges,
 # bends and thin parts. It is not that of the whole patch, for noise may differ from place to place.
@@ -79,12 +82,12 @@ class NeighbourhoodNoise:
     @classmethod
     def of(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
         """Look at the nearest points of some, as many of each patch, patch after patch."""
-        return cls._on(near.first(_FIT_NEIGHBOURS), patches)
+        return cls._on(near.first(FIT_NEIGHBOURS), patches)
 
     @classmethod
     def of_lines(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
         """Do the same where points lie in lines: the nearest of most are of one, which is in the plane of its beams."""
-        return cls._on(_around(near), patches)
+        return cls._on(_around(near, LINES_NEIGHBOURS), patches)
 
     @classmethod
     def _on(cls, near: Neighbourhoods, patches: int) -> NeighbourhoodNoise:
@@ -105,14 +108,14 @@ def low_noise_weight(ratios: Floats) -> float:
     return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
 
-def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float, *, in_lines: bool = False) -> Floats:
+def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
     """Return a step (n, 3), less of it where it is more than the noise.
 
-    low_noise: as of `low_noise_weight`; nearest: 16 or more of each of the n >= 1 points; in_lines: whether these lie
-    in lines, where 32 are looked at. Of moves m across the surface, with noise n, a share of n^2 / m^2 leaves least
-    error (Wiener's weight): what else they have is independent of the noise.
+    low_noise: as of `low_noise_weight`; nearest: 16 or more of each of the n >= 1 points. Of moves m across the
+    surface, with noise n, a share of n^2 / m^2 leaves least error (Wiener's weight): what else they have is independent
+    of the noise.
     """
-    here = _surfaces(_around(nearest) if in_lines else nearest.first(_FIT_NEIGHBOURS))
+    here = _surfaces(nearest.first(FIT_NEIGHBOURS))
     rise = (step * here.normals).sum(axis=1)
     place = _places(nearest)
     noise = np.quantile(here.stds[place], _NOISE_QUANTILE, axis=1)
@@ -151,10 +154,10 @@ def noise_on_surfaces(nearest: Nearest, patches: int) -> Floats:
     return noise
 
 
-def _around(nearest: Nearest) -> Neighbourhoods:
-    """Return those of the nearest that lie in all directions, on the host."""
-    distances, points = (on_host(array[:, :SCENE_NEIGHBOURS]) for array in (nearest.distances, nearest.points))
-    return Nearest(distances, points).in_all_directions(_FIT_NEIGHBOURS).first(_FIT_NEIGHBOURS)
+def _around(nearest: Nearest, count: int = SCENE_NEIGHBOURS) -> Neighbourhoods:
+    """Return 16 of the `count` nearest, which lie in all directions, on the host."""
+    distances, points = (on_host(array[:, :count]) for array in (nearest.distances, nearest.points))
+    return Nearest(distances, points).in_all_directions(FIT_NEIGHBOURS).first(FIT_NEIGHBOURS)
 
 
 def _noise_of_places(near: Neighbourhoods, place: npt.NDArray[np.int64]) -> Floats:

@@ -12,7 +12,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.low_noise import SCENE_NEIGHBOURS, limited_to_surfaces, wiener_share, wiener_weighted
+from straightpcf.model.low_noise import (
+    FIT_NEIGHBOURS,
+    LINES_NEIGHBOURS,
+    SCENE_NEIGHBOURS,
+    limited_to_surfaces,
+    wiener_share,
+    wiener_weighted,
+)
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.walls import share_between_walls
@@ -70,8 +77,10 @@ def restrained_step(
     scene, irregular, low_noise = trusted_noise is not None, sampling.irregular, sampling.low_noise
     if not (scene or irregular or low_noise > 0):
         return _between_walls(step, patch, sampling)
-    many = scene or sampling.in_lines
-    nearest = Nearest.of(patch[: len(step)], patch, SCENE_NEIGHBOURS if many else _PLANE_NEIGHBOURS)
+    count = LINES_NEIGHBOURS if sampling.in_lines else SCENE_NEIGHBOURS if scene else _PLANE_NEIGHBOURS
+    nearest = Nearest.of(patch[: len(step)], patch, count)
+    if sampling.in_lines:  # of its own line a point's nearest say nothing
+        nearest = nearest.in_all_directions(FIT_NEIGHBOURS)
     if trusted_noise is not None:
         near = nearest.first(_FEW_NEIGHBOURS)
         step = held_to_lines(limited_to_noise(moved, step, trusted_noise), patch, near)
@@ -80,7 +89,7 @@ def restrained_step(
     if irregular:
         step = without_tangential_motion(step, nearest)
     if low_noise > 0:
-        step = wiener_weighted(step, nearest, low_noise, in_lines=sampling.in_lines)
+        step = wiener_weighted(step, nearest, low_noise)
     if height_axis is not None:
         step = along_heights(step, nearest, height_axis)
     elif scene:

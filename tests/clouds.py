@@ -48,3 +48,18 @@ def even_sphere(count: int) -> npt.NDArray[np.float64]:
 def noisy(xyz: npt.NDArray[np.float64], noise_std: float, seed: int = 1) -> npt.NDArray[np.float64]:
     """Add Gaussian noise of `noise_std`, in the cloud's unit."""
     return xyz + noise_std * np.random.default_rng(seed).standard_normal(xyz.shape)
+
+
+def profiles(noise_std: float, ratio: int, count: int = 60) -> npt.NDArray[np.float64]:
+    """Return some profiles of a ball, so many times as far apart as their points, with noise in the plane of each."""
+    across = np.linspace(-0.97, 0.97, count)
+    parts = []
+    for y in across:
+        radius = np.sqrt(1 - y * y)
+        turn = np.linspace(0, 2 * np.pi, round(2 * np.pi * radius * ratio / (across[1] - across[0])), endpoint=False)
+        parts.append(np.column_stack([radius * np.cos(turn), np.full(len(turn), y), radius * np.sin(turn)]))
+    clean = np.concatenate(parts)
+    beams = clean * [1.0, 0.0, 1.0] / np.linalg.norm(clean[:, ::2], axis=1, keepdims=True)
+    rng = np.random.default_rng(0)
+    out: npt.NDArray[np.float64] = clean + noise_std * beams * rng.standard_normal((len(clean), 1))
+    return out

@@ -9,7 +9,7 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.layers import Layers
 from straightpcf.model.patches import cut_patches
-from tests.clouds import distance_to_torus, noisy, sphere, torus
+from tests.clouds import distance_to_torus, noisy, profiles, sphere, torus
 
 Floats = npt.NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def slices() -> Floats:
     return np.column_stack([np.cos(6.28 * turn), np.sin(6.28 * turn), height]) * (1 - 0.5 * height[:, None])
 
 
-def profiles() -> Floats:
+def sheet_in_profiles() -> Floats:
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 2, 0.04), np.arange(0, 2, 0.01)))
     return np.column_stack([x, y, 0.1 * np.sin(4 * x) * np.cos(3 * y)])
 
@@ -102,7 +102,8 @@ def box() -> Floats:
         np.unique(np.round(sphere(50_000) / 0.05) * 0.05, axis=0),  # voxels
         stairs(),
         slices(),
-        profiles(),
+        sheet_in_profiles(),
+        profiles(0.005, 10, 38),
         floor_and_ball(),
         box(),
         np.round(box(), 2),
@@ -117,6 +118,7 @@ def box() -> Floats:
         "stairs",
         "slices",
         "profiles",
+        "noisy-profiles",
         "floor",
         "box",
         "rounded-box",

@@ -14,7 +14,7 @@ from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import chamfer_distance
 from straightpcf.model.patches import cut_patches
 from straightpcf.model.spacing import Sampling
-from tests.clouds import even_sphere, noisy, sphere, torus
+from tests.clouds import even_sphere, noisy, profiles, sphere, torus
 
 
 def irregular(xyz: np.ndarray, noise_std: float) -> bool:
@@ -40,32 +40,23 @@ def test_lines_are_not_even() -> None:
     assert not irregular(squares, 0.01)
 
 
-def profiles(noise_std: float, ratio: int) -> np.ndarray:
-    """Return a ball's profiles, so many times as far apart as their points, with noise in the plane of each."""
-    across = np.linspace(-0.97, 0.97, 60)
-    parts = []
-    for y in across:
-        radius = np.sqrt(1 - y * y)
-        turn = np.linspace(0, 2 * np.pi, round(2 * np.pi * radius * ratio / (across[1] - across[0])), endpoint=False)
-        parts.append(np.column_stack([radius * np.cos(turn), np.full(len(turn), y), radius * np.sin(turn)]))
-    clean = np.concatenate(parts)
-    beams = clean * [1.0, 0.0, 1.0] / np.linalg.norm(clean[:, ::2], axis=1, keepdims=True)
-    rng = np.random.default_rng(0)
-    return clean + noise_std * beams * rng.standard_normal((len(clean), 1))
-
-
 def test_the_noise_of_a_scanners_profiles_shows_beside_them_alone() -> None:
-    rough = profiles(0.01, 10)
+    rough = profiles(0.01, 10, 38)
     patches = cut_patches(rough, coverage=3.0, seed=0)
     found = Sampling.of(rough, patches, 0.01)
     assert found.in_lines
     assert found.low_noise < 0.5
     assert Sampling.of(rough, patches, 0.01, survey=partial(survey.survey_on, torch.device("cpu"))) == found
-    for other in (profiles(0.0, 10), sphere(5000), noisy(even_sphere(5000), 0.002)):
+    for other in (profiles(0.0, 10, 38), sphere(5000), noisy(even_sphere(5000), 0.002)):
         assert not Sampling.of(other, cut_patches(other, coverage=3.0, seed=0), 0.002).in_lines
     result = load_filter(threads=2).denoise(rough)
     before, after = (np.sqrt(np.mean((np.linalg.norm(xyz, axis=1) - 1) ** 2)) for xyz in (rough, result.xyz))
     assert after < 0.5 * before
+
+
+def test_profiles_that_are_far_apart_are_told_by_points_of_others() -> None:
+    rough = profiles(0.003, 20, 26)
+    assert Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), 0.003).in_lines
 
 
 @pytest.mark.parametrize("together", [1, 7, 1000])
