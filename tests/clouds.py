@@ -50,8 +50,8 @@ def noisy(xyz: npt.NDArray[np.float64], noise_std: float, seed: int = 1) -> npt.
     return xyz + noise_std * np.random.default_rng(seed).standard_normal(xyz.shape)
 
 
-def profiles(noise_std: float, ratio: int, count: int = 60) -> npt.NDArray[np.float64]:
-    """Return some profiles of a ball, so many times as far apart as their points, with noise in the plane of each."""
+def profiles(noise_std: float, ratio: int, count: int) -> npt.NDArray[np.float64]:
+    """Return `count` profiles of a ball, `ratio` times as far apart as their points, with noise in their planes."""
     across = np.linspace(-0.97, 0.97, count)
     parts = []
     for y in across:
