@@ -15,6 +15,9 @@ __all__ = ["DENSE_FROM_RADII", "FEWEST_POINTS", "FEW_POINTS", "Calibration"]
 
 # d of noise that one pass takes most of: hardly any, little, and what leaves more of thin bodies (1.5 to 2 %).
 _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
+# Up to this d, which says as much of shape as of noise, a second pass that is not due is made all the same where its
+# step would be less coherent (`model.coherence`) than the first, and one that is due is not from the second on.
+_FAINT_DISTANCE, _NOISE_COHERENCE, _SHAPE_COHERENCE = 0.25, 0.08, 0.15
 # What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
 # a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
 _STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, DENSE_FROM_RADII = 0.7, 8.0, 0.03
@@ -133,6 +136,16 @@ class Calibration:
         if done >= most or not (done < due or polishing or left or now > self.stirred):
             return 0
         return 1 if done == most - 1 or (polishing and done == polished - 1 and not dense) else 2
+
+    def asks_for_coherence(self, distances: Sequence[float], points: int) -> bool:
+        """Say whether the number of passes of an object depends on how coherent the step of the next one would be."""
+        return len(distances) == 2 and distances[0] < _FAINT_DISTANCE and points >= FEW_POINTS
+
+    def passes_by_coherence(self, left: int, coherence: float) -> int:
+        """Say how many passes to go, 0, 1 or 2, where `passes_left` says `left`, by how coherent the next step is."""
+        if left == 0:
+            return 1 if coherence < _NOISE_COHERENCE else 0
+        return left if coherence < _SHAPE_COHERENCE else 0
 
     def _most_of_few(self, distances: Sequence[float], noise_in_radii: float, points: int, irregular: bool) -> int:
         if points < FEWEST_POINTS:

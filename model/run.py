@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.calibration import FEWEST_POINTS
+from straightpcf.model.coherence import summed_coherence
 from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["MIN_POINTS", "DenoiseResult", "FinishedPatch", "Run"]
 
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
+_COHERENCE_PROBES = 8  # patches whose step is looked at
 _PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
@@ -154,7 +156,7 @@ class Run:
                 tiling = self._tiling(positions, tiles)
                 reading = self.reader.read(positions, tiling, None)
             self.readings.append(reading)
-            left = self._passes_left(planned)
+            left = self._passes_left(planned, positions)
             if left == 0:
                 self.noise_after = self._noise_left(tiles)
                 return
@@ -230,20 +232,41 @@ class Run:
         """The DistanceModule's median before each pass and after the last."""
         return tuple(reading.distance for reading in self.readings)
 
-    def _passes_left(self, planned: int | None) -> int:
+    def _passes_left(self, planned: int | None, positions: npt.NDArray[np.float64]) -> int:
         if planned is not None:
             return planned - self.iterations
-        first, calibration = self.readings[0], self.filter.calibration
+        first, calibration, points = self.readings[0], self.filter.calibration, len(positions)
+        asked = not (first.scene or self.layers) and calibration.asks_for_coherence(self.distances, points)
         left = (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
-            points=len(self.points.xyz),
+            points=points,
             irregular=first.sampling.irregular,
             thin_walls=first.sampling.thin_walls,
             shown_walls=self._rounds > ROUNDS,
             thicknesses=[reading.thickness for reading in self.readings],
         )
+        if asked and (coherence := self._coherence(positions)) is not None:
+            left = calibration.passes_by_coherence(left, coherence)
         return max(left, _PASSES_OF_LAYERS - self.iterations) if self.layers else left
+
+    def _coherence(self, positions: npt.NDArray[np.float64]) -> float | None:
+        """Return how coherent the next pass's step would be, by a few patches; None where they do not say."""
+        reading = self.readings[-1]
+        if reading.probes is None:
+            return None
+        some = slice(None, None, max(1, len(reading.probes.seeds) // _COHERENCE_PROBES))
+        cut = reading.probes[some]
+        scales = patch_scales(cut.radii, scene=False)
+        known = dict(enumerate(list(reading.known_distances.values())[some]))
+
+        def summed(patch: int, displacement: npt.NDArray[np.float64]) -> tuple[float, float]:
+            owned, step, _ = self._restrained_step(positions, cut, scales, reading, None, patch, displacement)
+            return summed_coherence(step, positions[owned], positions.take(cut.index[patch], axis=0))
+
+        found = self.filter.processor.displacements(positions, cut, scales, known, summed, agree=False)
+        products, squares = np.sum([sums for sums in found if sums is not None], axis=0)
+        return float(products / squares) if squares > 0 else None
 
     def _spread_step(
         self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None
