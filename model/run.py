@@ -236,7 +236,8 @@ class Run:
         if planned is not None:
             return planned - self.iterations
         first, calibration, points = self.readings[0], self.filter.calibration, len(positions)
-        asked = not (first.scene or self.layers) and calibration.asks_for_coherence(self.distances, points)
+        object_ = not (first.scene or first.sampling.of_place or self.layers)
+        asked = object_ and calibration.asks_for_coherence(self.distances, points)
         left = (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
@@ -334,7 +335,7 @@ class Run:
         owned, step = cut.owned_points(patch), displacement / scales[patch]
         if not self.filter.zoom or not (reading.scene or reading.sampling.restrains):
             return owned, step, False
-        limit = None if trusted_noise is None else trusted_noise[patch]
+        limit = reading.sampling.noise_of_place if trusted_noise is None else trusted_noise[patch]
         moved, around = self.moved[owned], positions.take(cut.index[patch], axis=0)
         step, held_back = restrained_step(
             step,

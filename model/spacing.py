@@ -10,6 +10,7 @@ from straightpcf.model.arrays import on_host
 from straightpcf.model.low_noise import EXACT_PLANE_RATIO, NeighbourhoodNoise, low_noise_weight
 from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import HIGH_NOISE
+from straightpcf.model.openness import is_of_open_place
 from straightpcf.model.patches import Patches
 from straightpcf.model.processor import Floats
 from straightpcf.model.spread import ROUNDS
@@ -32,6 +33,8 @@ _LINES_AREA_RATIO = 1.3
 # Where so many points are far off their neighbours' surface, and what was read is so many times the noise of the
 # others, it is the noise of those few.
 _LOUD_SHARE, _LOUD_RATIO = 0.005, 1.7
+# Few neighbours show less noise than there is, and some points of a place have more than most.
+_BELIEVED_RATIO = 1.5
 # The more evenly points lie, the more the network believes in layers of them: in two walls or, where noise is more than
 # it was trained on (HIGH_NOISE), in two of one surface. So where that is and hardly any patch may hide walls, points
 # are spread in fewer rounds; in more where noise (its std in the unit ball) is strong, many patches may hide walls, and
@@ -51,7 +54,8 @@ class Sampling:
     beside the distances between them, 0 to 1; thin_walls: whether they may be on walls closer together than these;
     hiding_share: of their patches, in which noise may hide such; uncovered: whether a pass has taken most of it, and
     walls that it hid were looked for; noise_of_most: the noise std of most points, where a few have so much more that
-    theirs is what is read of all, else infinite.
+    theirs is what is read of all, else infinite; of_place: whether these few are leaves, poles and what else
+    is scattered over a place of which few points are left.
     """
 
     irregular: bool = False
@@ -61,11 +65,17 @@ class Sampling:
     hiding_share: float = 0.0
     uncovered: bool = False
     noise_of_most: float = np.inf
+    of_place: bool = False
 
     @property
     def restrains(self) -> bool:
         """Whether a step of an object is not made as the network asks for it."""
         return self.irregular or self.thin_walls or self.low_noise > 0
+
+    @property
+    def noise_of_place(self) -> float | None:
+        """The noise std that is believed of all points of a place, as of a scene's; None of an object."""
+        return _BELIEVED_RATIO * self.noise_of_most if self.of_place else None
 
     @classmethod
     def of(cls, xyz: Floats, patches: Patches, noise_std: float, *, survey: Survey = survey) -> Sampling:
@@ -84,8 +94,15 @@ class Sampling:
         enough = patches.index.shape[1] >= _LEAST_PATCH_POINTS
         irregular = enough and _is_irregular(areas, noise_std, thin_walls=thin_walls)
         low_noise = low_noise_weight(np.concatenate([n.in_radii for n in noise]))
-        hidden = hiding_share(shares)
-        return cls(irregular, in_lines, low_noise, thin_walls, hiding_share=hidden, noise_of_most=noise_of_most)
+        return cls(
+            irregular,
+            in_lines,
+            low_noise,
+            thin_walls,
+            hiding_share=hiding_share(shares),
+            noise_of_most=noise_of_most,
+            of_place=low_noise > 0 and np.isfinite(noise_of_most) and is_of_open_place(xyz),
+        )
 
     def after_pass(self, xyz: Floats, patches: Patches, *, survey: Survey = survey) -> Sampling:
         """Return the same of the points (N, 3) that a pass has left: walls that noise had hidden may show now."""
