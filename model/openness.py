@@ -15,9 +15,9 @@ _ASKED, _NEIGHBOURS = 3000, 24  # points, evenly among all in their order, and o
 # A point is at a border where its neighbours leave out a third of the directions in their plane: at the rim of what was
 # scanned, of a shadow, of a leaf. 0.05 to 0.3 of a place's points are, 0.05 of an object's and less.
 _BORDER_DEGREES, _BORDER_SHARE = 120, 0.04
-# Of a place so many planes are as near to one, the ground's or a wall's, and half of its extent along their
-# normal, in the unit ball, is no more; of whole objects with borders 0.25 are, of those that are seen from one side 0.5
-# to 0.75, but most of these reach 0.5 and more.
+# Of a place such a share of planes and more are within so many degrees of one, the ground's or a wall's, and half of
+# its extent along their normal, in the unit ball, is no more than the last. Of whole objects with borders 0.25 are, of
+# those that are seen from one side 0.5 to 0.75, but most of these reach 0.5 and more.
 _ALIKE_DEGREES, _ALIKE_SHARE, _LARGEST_EXTENT = 15, 0.35, 0.4
 _CANDIDATES = 200  # planes with which all others are compared
 _OUTSIDE_SHARE = 0.01  # of the points on either side, which may be strays and do not count for the extent

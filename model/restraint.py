@@ -70,8 +70,8 @@ def restrained_step(
 
     moved: (n, 3), by the passes before; patch: (P, 3) points, of which the first n make the step; sampling: of the
     cloud; trusted_noise: the noise std that is believed of a scene's patch (`trusted_noise_stds`), or of a place of few
-    points (`Sampling.of_place`), None of an object's;
-    most_on_surfaces: as of a scene's Reading; height_axis: that of a raster's heights, which alone move.
+    points (`Sampling.noise_of_place`), None of an object's; most_on_surfaces: as of a scene's Reading;
+    height_axis: that of a raster's heights, which alone move.
     """
     if len(step) == 0:
         return step, False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from straightpcf.model.coherence import summed_coherence
 from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
+from straightpcf.model.neighbourhoods import INNER_SHARE
 from straightpcf.model.noise import NoiseReader, Reading
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated, without_data
@@ -258,6 +259,8 @@ class Run:
             return None
         some = slice(None, None, max(1, len(reading.probes.seeds) // _COHERENCE_PROBES))
         cut = reading.probes[some]
+        if not cut.owned.any():  # as of a tiled cloud's probes
+            cut = replace(cut, owned=np.full(len(cut.seeds), round(INNER_SHARE * cut.index.shape[1])))
         scales = patch_scales(cut.radii, scene=False)
         known = dict(enumerate(list(reading.known_distances.values())[some]))
 

@@ -60,3 +60,8 @@ def test_a_ball_with_little_noise_gets_a_second_pass_and_ends_nearer_for_it() ->
     one = shipped.denoise(noise, DenoiseOptions(iterations=1))
     height, of_one = (np.square(np.linalg.norm(xyz, axis=1) - 1).mean() for xyz in (result.xyz, one.xyz))
     assert height < 0.7 * of_one
+
+
+def test_tiles_do_not_change_how_many_passes_little_noise_gets() -> None:
+    result = load_filter(device="cpu", tile_points=10_000).denoise(noisy(even_sphere(12_000), 0.003))
+    assert result.iterations == 2
