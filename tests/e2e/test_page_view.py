@@ -57,6 +57,11 @@ def _shown(page: Any, file: Path, xyz: np.ndarray) -> np.ndarray:
 
 
 def _drawn(page: Any) -> np.ndarray:
-    """Return what is seen once the frame that was asked for is drawn."""
+    """Return what is seen once the frame that was asked for is drawn, and the layout has come to rest."""
     page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    return picture(page)
+    seen = picture(page)
+    for _ in range(20):
+        before, seen = seen, picture(page)
+        if before.shape == seen.shape and (before == seen).all():
+            return seen
+    raise AssertionError("the viewer does not come to rest")
