@@ -8,10 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.arrays import on_host
 from straightpcf.model.calibration import DENSE_FROM_RADII, Calibration
-from straightpcf.model.low_noise import EXACT_PLANE_RATIO, noise_on_surfaces
-from straightpcf.model.neighbourhoods import Nearest
+from straightpcf.model.low_noise import noise_on_surfaces
 from straightpcf.model.normalize import (
     HIGH_NOISE,
     is_dense_object,
@@ -25,10 +23,12 @@ from straightpcf.model.normalize import (
     zoom_of_rest,
 )
 from straightpcf.model.patches import Patches
+from straightpcf.model.planes import across_planes, thickness_of, thickness_ratios
 from straightpcf.model.processor import Floats, Processor
 from straightpcf.model.raster import height_axis
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling
+from straightpcf.model.views import View
 
 __all__ = ["NoiseReader", "Reading", "ScenePatches"]
 
@@ -48,13 +48,11 @@ _UNCOVERED_UP_TO_RADII = 0.045
 # Where one patch in ten reads so many times the noise of another one in ten, noise is not the same all over an object.
 _UNEVEN_RATIO, _ENOUGH_PROBES = 2.0, 10
 _MOST_POINTS_SHARE = 0.8  # of a scene's points have no more noise than is believed of any: see `restraint`
-# Where half of a scene's points have their nearest in a plane (std across it below a share of the lesser one along it,
-# and that above one of the greater: no line), no more noise is believed than twice what four fifths of these show.
-_SEEN_NEIGHBOURS, _SEEN_PLANE_RATIO, _SEEN_LINE_RATIO, _SEEN_SHARE, _SEEN_RATIO = 24, 0.3, 0.2, 0.5, 2.0
+# Where half of a scene's points have their nearest in a plane, no more noise is believed than twice what four fifths of
+# these show.
+_SEEN_SHARE, _SEEN_RATIO = 0.5, 2.0
 # Of what surfaces leave of half of a scene's points: more is not believed of any place by its surfaces.
 _MOST_ON_SURFACES_RATIO = 3.0
-_PLANE_FREEDOM = 3  # that a plane takes of its points
-_THICKNESS_NEIGHBOURS = 12
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
 # of how far they spread along it: the network sees noise in a tree, too.
 _FLAT_PATCH_STDS, _FLAT_RATIO = 1.3, 0.4
@@ -72,8 +70,9 @@ class Reading:
     scene's points have, or less; most_on_surfaces: what is believed of any place of a scene by a few neighbours, before
     the first pass; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud; probes: the patches that were read; thickness: of the surface that a pass has left
-    of dense points, the median of the std of each point's nearest across their plane by the lesser one along it.
+    raster, None of any other cloud; view: the place that the cloud was seen from, None where its points are no raster
+    of beams; probes: the patches that were read; thickness: of the surface that a pass has left of dense points, the
+    median of the std of each point's nearest across their plane by the lesser one along it.
     """
 
     distance: float
@@ -89,6 +88,7 @@ class Reading:
     high_noise: bool = False
     uneven: bool = False
     height_axis: int | None = None
+    view: View | None = None
     probes: Patches | None = None
     thickness: float = 0.0
 
@@ -113,14 +113,27 @@ class NoiseReader:
     """Reads clouds in the unit ball, (N, 3) float64, with one network on one processor."""
 
     def __init__(
-        self, processor: Processor, calibration: Calibration, tile: Callable[[Floats], Tiling], *, zoom: bool
+        self,
+        processor: Processor,
+        calibration: Calibration,
+        tile: Callable[[Floats], Tiling],
+        *,
+        zoom: bool,
+        origin: Floats | None = None,
+        device: str = "cpu",
     ) -> None:
-        """tile: cuts some of the points into patches. zoom: whether the noise changes what a pass does."""
+        """tile: cuts some of the points into patches; zoom: whether the noise changes what a pass does; device: a name.
+
+        origin: (3,), that of the cloud's own coordinates in the unit ball, where its scanner may have been.
+        """
         self._processor, self._calibration, self._tile, self._zoom = processor, calibration, tile, zoom
+        self._origin, self._device = origin, device
         self._largest_noise = float(calibration.noise[-1])
 
-    def read(self, positions: Floats, tiling: Tiling, first: Reading | None) -> Reading:
+    def read(self, positions: Floats, tiling: Tiling, first: Reading | None, *, view: View | None = None) -> Reading:
         """Read the noise of a cloud; first: the reading before the first pass, None where this is it.
+
+        view: the place that it was seen from, where that is known.
 
         What is a scene is said once: patches shrink as the noise goes. Where the pass shows the whole cloud in another
         size than that of the reading, d is read in that size, too.
@@ -128,16 +141,18 @@ class NoiseReader:
         probes, numbers = tiling.probes()
         if first is None:
             axis = height_axis(positions) if self._zoom else None
+            if view is None and axis is None and self._zoom:
+                view = View.of(positions, probes, self._origin, self._device)
             radii = (_quantile(probes.radii, probes.owned, share) for share in (0.1, 0.5, 0.9))
             scene = axis is not None or is_scene(*radii)
         else:
-            axis, scene = first.height_axis, first.scene
+            axis, scene, view = first.height_axis, first.scene, first.view
         if scene:
-            reading = self._read_scene(positions, tiling, probes, axis, first=first is None)
+            reading = self._read_scene(positions, tiling, probes, axis, view, first=first is None)
             settled = first is not None or axis is not None or not self._zoom
             if settled or not is_dense_object(reading.noise_std, probes.radii, len(positions)):
                 return reading
-        return self._read_object(positions, tiling, probes, numbers, first)
+        return self._read_object(positions, tiling, probes, numbers, view, first)
 
     def with_walls(self, positions: Floats, reading: Reading, first: Reading) -> Reading:
         """Return the reading of what a pass has left, before another: walls that noise had hidden may show now."""
@@ -156,7 +171,7 @@ class NoiseReader:
         scales = patch_scales(cut.radii, scene=True)
         distances = usual = self._processor.distances(positions, cut, scales)
         noise = self.noise_stds(distances, scales)
-        thickness, width = np.array([_thickness(positions[rows]) for rows in cut.index]).T
+        thickness, width = np.array([thickness_of(positions[rows]) for rows in cut.index]).T
         thin = thickness < _FLAT_RATIO * width
         zoom = zoom_of_flat(noise * scales) if self._zoom else np.ones(len(scales))
         if (smaller := zoom < 1).any():
@@ -180,13 +195,19 @@ class NoiseReader:
         return self._calibration.noise_std(distances) / scales
 
     def _read_object(
-        self, positions: Floats, tiling: Tiling, probes: Patches, numbers: range, first: Reading | None
+        self,
+        positions: Floats,
+        tiling: Tiling,
+        probes: Patches,
+        numbers: range,
+        view: View | None,
+        first: Reading | None,
     ) -> Reading:
         """Read the noise of an object; numbers: which patches of a whole cut the probes are, none of a tiled one."""
         scales = patch_scales(probes.radii, scene=False)
         distances = self._processor.distances(positions, probes, scales)
         if first is None:
-            reading = self._first_of_object(positions, tiling, probes, distances, scales)
+            reading = self._first_of_object(positions, tiling, probes, view, distances, scales)
         else:
             reading = self._next_of_object(positions, tiling, probes, distances, scales, first)
         if reading.uneven or reading.parts != (1,):  # patches are shown in other sizes, or are others
@@ -197,17 +218,21 @@ class NoiseReader:
         return replace(reading, known_distances=dict(zip(numbers, distances.tolist(), strict=False)))
 
     def _first_of_object(
-        self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats
+        self, positions: Floats, tiling: Tiling, probes: Patches, view: View | None, distances: Floats, scales: Floats
     ) -> Reading:
         """Say how the first pass shows an object; distances: what the DistanceModule says of its probes, (M,)."""
         noise = self._noise_std(distances, scales)
         sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
+        if view is not None:
+            sampling = replace(sampling, irregular=True)
         in_radii = noise_in_radii(noise, probes.radii)
-        reading = Reading(float(np.median(distances)), noise, False, sampling, noise_in_radii=in_radii, probes=probes)
+        distance = float(np.median(distances))
+        reading = Reading(distance, noise, False, sampling, noise_in_radii=in_radii, view=view, probes=probes)
         if not self._zoom:
             return reading
         noise = self._reread(positions, tiling, noise)
-        zoom, radius = zoom_of(noise, probes.radii), float(np.median(probes.radii))
+        # What lies along beams alone is shown as it is: larger, walls of it become two.
+        zoom, radius = 1.0 if view else zoom_of(noise, probes.radii), float(np.median(probes.radii))
         return replace(
             reading,
             noise_std=noise,
@@ -223,12 +248,13 @@ class NoiseReader:
         """Say how a later pass shows an object; distances: as of `_first_of_object`."""
         noise, zoom, thickness = self._noise_std(distances, scales), 1.0, 0.0
         if first.noise_in_radii > DENSE_FROM_RADII:
-            thicknesses = self._processor.survey(positions, probes, _thickness_ratios)
+            thicknesses = self._processor.survey(positions, probes, thickness_ratios)
             thickness = float(np.median(np.concatenate(list(thicknesses))))
         if self._zoom and first.high_noise and noise > _REREAD_FROM * self._largest_noise:
             zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
         distance = float(np.median(distances))
-        return Reading(distance, noise, False, first.sampling, zoom, probes=probes, thickness=thickness)
+        view = first.view
+        return Reading(distance, noise, False, first.sampling, zoom, view=view, probes=probes, thickness=thickness)
 
     def _reread(self, positions: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""
@@ -243,7 +269,7 @@ class NoiseReader:
         return noise
 
     def _read_scene(
-        self, positions: Floats, tiling: Tiling, probes: Patches, axis: int | None, *, first: bool
+        self, positions: Floats, tiling: Tiling, probes: Patches, axis: int | None, view: View | None, *, first: bool
     ) -> Reading:
         """Read the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
         raster = axis is not None
@@ -267,6 +293,7 @@ class NoiseReader:
             noise_of_most=noise_of_most,
             most_on_surfaces=most_on_surfaces,
             height_axis=axis,
+            view=view,
             probes=probes,
         )
 
@@ -275,7 +302,9 @@ class NoiseReader:
 
         In trees the DistanceModule reads noise, and more of it than the ground has; planes of a few points do not.
         """
-        stds, are_planes = map(np.concatenate, zip(*self._processor.survey(positions, probes, _across), strict=True))
+        stds, are_planes = map(
+            np.concatenate, zip(*self._processor.survey(positions, probes, across_planes), strict=True)
+        )
         if are_planes.mean() < _SEEN_SHARE:
             return np.inf
         return _SEEN_RATIO * float(np.quantile(stds[are_planes], _MOST_POINTS_SHARE))
@@ -341,21 +370,6 @@ class NoiseReader:
         return float(np.median(self.noise_stds(distances, scales)))
 
 
-def _across(nearest: Nearest, _patches: int) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    """Return the std of each point's neighbours across their plane, and whether that tells noise: (n,) each."""
-    near = nearest.first(_SEEN_NEIGHBOURS)
-    least, less, most = np.sqrt(np.maximum(on_host(near.variances), 0.0) / (near.local.shape[1] - _PLANE_FREEDOM)).T
-    is_plane = (least > EXACT_PLANE_RATIO * less) & (least < _SEEN_PLANE_RATIO * less)
-    return least, is_plane & (less > _SEEN_LINE_RATIO * most)
-
-
-def _thickness_ratios(nearest: Nearest, _patches: int) -> Floats:
-    """Return the std of each point's nearest across their plane by the lesser one along it: (n,)."""
-    across, along, _ = np.sqrt(np.maximum(on_host(nearest.first(_THICKNESS_NEIGHBOURS).variances), 0.0)).T
-    ratios: Floats = np.divide(across, along, out=np.zeros_like(across), where=along > 0)
-    return ratios
-
-
 def _is_uneven(noise_stds: Floats, zoom: float) -> bool:
     """Say of the noise stds of some patches whether noise, not only shape, differs, and some must be shown smaller."""
     low, high = np.quantile(noise_stds, (0.1, 0.9))
@@ -376,10 +390,3 @@ def _quantile(values: Floats, owned: npt.NDArray[np.int64], share: float) -> flo
     order = np.argsort(values)
     below = np.cumsum(owned[order] if owned.any() else np.ones(len(order)))
     return float(values[order][np.searchsorted(below, share * below[-1])])
-
-
-def _thickness(points: Floats) -> tuple[float, float]:
-    """Return the std of points (n, 3) across the plane that fits them best, and the lesser one along it."""
-    local = points - points.mean(axis=0)
-    across, along, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(local.T @ local), 0.0) / len(points))
-    return float(across), float(along)

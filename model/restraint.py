@@ -22,6 +22,7 @@ from straightpcf.model.low_noise import (
 )
 from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods
 from straightpcf.model.spacing import Sampling
+from straightpcf.model.views import View, along_beams
 from straightpcf.model.walls import share_between_walls
 
 __all__ = [
@@ -65,13 +66,15 @@ def restrained_step(
     trusted_noise: float | None,
     most_on_surfaces: float = np.inf,
     height_axis: int | None = None,
+    view: View | None = None,
+    noise_std: float = np.inf,
 ) -> tuple[npt.NDArray[np.float64], bool]:
     """Return what is made of a step (n, 3), and whether it would have joined walls.
 
     moved: (n, 3), by the passes before; patch: (P, 3) points, of which the first n make the step; sampling: of the
     cloud; trusted_noise: the noise std that is believed of a scene's patch (`trusted_noise_stds`), or of a place of few
     points (`Sampling.noise_of_place`), None of an object's; most_on_surfaces: as of a scene's Reading;
-    height_axis: that of a raster's heights, which alone move.
+    height_axis: that of a raster's heights, which alone move; view: whose beams points move along alone.
     """
     if len(step) == 0:
         return step, False
@@ -95,6 +98,8 @@ def restrained_step(
         step = along_heights(step, nearest, height_axis)
     elif scene:
         step = limited_to_surfaces(step, nearest, most_on_surfaces)
+    if view is not None:
+        step = along_beams(step, patch, view, noise_std if trusted_noise is None else trusted_noise)
     return step, held_back
 
 

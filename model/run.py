@@ -103,7 +103,10 @@ class Run:
         self.readings: list[Reading] = []  # before each pass, and after the last
         self._rounds = ROUNDS  # of spreading, before each pass but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
-        self.reader = NoiseReader(owner.processor, owner.calibration, self._tiling, zoom=owner.zoom)
+        origin = -self.frame.centre / max(self.frame.radius, 1e-300)
+        self.reader = NoiseReader(
+            owner.processor, owner.calibration, self._tiling, zoom=owner.zoom, origin=origin, device=owner.device
+        )
 
     def _of_rows(self) -> npt.NDArray[np.float64]:
         """Return the rows that are filtered, without a copy where they are all."""
@@ -155,7 +158,7 @@ class Run:
                 self.moved += within
                 positions += within
                 tiling = self._tiling(positions, tiles)
-                reading = self.reader.read(positions, tiling, None)
+                reading = self.reader.read(positions, tiling, None, view=reading.view)
             self.readings.append(reading)
             left = self._passes_left(planned, positions)
             if left == 0:
@@ -181,7 +184,8 @@ class Run:
         if layers is None or not layers.wide:
             return None
         self.steps = f"the points lie in layers along {'xyz'[layers.axis]}: each was taken to be anywhere in its own"
-        return layers.anywhere_within(self.options.seed)
+        within = layers.anywhere_within(self.options.seed)
+        return within if reading.view is None else reading.view.as_far_along(positions, within, layers.axis)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""
@@ -348,6 +352,8 @@ class Run:
             trusted_noise=limit,
             most_on_surfaces=self.readings[0].most_on_surfaces,
             height_axis=reading.height_axis,
+            view=reading.view,
+            noise_std=self.readings[0].noise_std,
         )
         return owned, step, held_back
 
