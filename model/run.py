@@ -184,8 +184,7 @@ class Run:
         if layers is None or not layers.wide:
             return None
         self.steps = f"the points lie in layers along {'xyz'[layers.axis]}: each was taken to be anywhere in its own"
-        within = layers.anywhere_within(self.options.seed)
-        return within if reading.view is None else reading.view.as_far_along(positions, within, layers.axis)
+        return layers.anywhere_within(self.options.seed)
 
     def result(self, seconds: float) -> DenoiseResult:
         """Put the moved rows back among the others."""

@@ -33,7 +33,6 @@ _PLANE_NEIGHBOURS, _BESIDE_DEPTHS, _PLANE_ROUNDS, _OFF_PLANE_STDS = 48, 5.0, 3, 
 # How far that plane is off, beside the noise along the beams; noise stds that a point is off it, or its neighbours are,
 # from where on it lies in no such plane.
 _GRAZING, _ALONE_STDS, _THICK_STDS = 0.1, 3.0, 2.0
-_STEEP = 0.3  # cosine of a beam and an axis below which what goes along the axis does not go along the beam
 _LEAST = 1e-12  # of lengths in the unit ball
 _STD_OF_MEDIAN, _RIDGE = 1.4826, 1e-9  # of absolute deviations, normal noise; what is added to a singular matrix
 _LEAST_TOWARDS, _NOWHERE = 0.1, 1e9  # cosine of two beams, below which one has no place in the other's image: far away
@@ -119,15 +118,6 @@ class View:
         out: Floats = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), _LEAST)
         return out
 
-    def as_far_along(self, points: Floats, step: Floats, axis: int) -> Floats:
-        """Return steps (n, 3) of points (n, 3) along their beams, as far along an axis as those that are given."""
-        beams = self.beams(points)
-        steep = np.abs(beams[:, axis]) < _STEEP
-        out: Floats = np.where(
-            steep[:, None], step, beams * (step[:, axis] / np.where(steep, 1.0, beams[:, axis]))[:, None]
-        )
-        return out
-
     def image(self, points: Floats) -> Floats:
         """Return where points (n, 3) are seen beside the first, (n, 2): on the plane through it across its beam."""
         beams, apart = self.beams(points), points - points[0]
@@ -154,7 +144,7 @@ def along_beams(step: Floats, patch: Floats, view: View, noise_std: float) -> Fl
     upright = (normals * beams).sum(axis=1, keepdims=True)
     across = (step * normals).sum(axis=1, keepdims=True)
     along = across * upright / (np.square(upright) + _GRAZING**2)
-    alone = (off > _ALONE_STDS * noise_std) | (thickness > _THICK_STDS * noise_std)
+    alone = (off > _ALONE_STDS * np.maximum(noise_std, thickness)) | (thickness > _THICK_STDS * noise_std)
     of_none = (step * beams).sum(axis=1, keepdims=True) * beams
     out: Floats = np.where(alone[:, None], of_none, along * beams + (across - along * upright) * normals)
     return out
@@ -228,9 +218,11 @@ class _Raster:
         found, best = irregularity(tried := _half_sphere(_DIRECTIONS).to(device)).topk(_BEST, largest=False)
         directions = tried[best]
         turn, angles = _FIRST_TURN, torch.arange(_AROUND, device=device) * (2 * np.pi / _AROUND)
-        circle = torch.stack([angles.cos(), angles.sin()], dim=1)
+        circle, units = torch.stack([angles.cos(), angles.sin()], dim=1), torch.eye(3, device=device)
         for _ in range(_ROUNDS):
-            across = torch.linalg.svd(directions[:, None])[2][:, 1:]  # (best, 2, 3)
+            first = torch.linalg.cross(directions, units[directions.abs().argmin(dim=1)])
+            across = torch.stack([first, torch.linalg.cross(directions, first)], dim=1)  # (best, 2, 3)
+            across = torch.nn.functional.normalize(across, dim=2)
             around = torch.nn.functional.normalize(directions[:, None] + turn * circle @ across, dim=2)
             each = torch.cat([directions[:, None], around], dim=1)
             found, at = irregularity(each.flatten(0, 1)).view(_BEST, -1).min(dim=1)
@@ -247,8 +239,12 @@ class _Raster:
 
 def _are_regular(rasters: list[_Raster], views: list[View]) -> bool:
     """Say whether most of some rasters are regular, each from its own view."""
-    regular = [raster.irregularity(view) <= _REGULAR for raster, view in zip(rasters, views, strict=True)]
-    return float(np.mean(regular)) >= _REGULAR_SHARE
+    others = 0
+    for raster, view in zip(rasters, views, strict=True):
+        others += raster.irregularity(view) > _REGULAR
+        if others > (1 - _REGULAR_SHARE) * len(rasters):
+            return False
+    return True
 
 
 def _irregularity(distances: torch.Tensor, across_places: torch.Tensor, nearest: float) -> torch.Tensor:

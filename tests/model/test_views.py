@@ -111,13 +111,6 @@ def test_what_lies_before_a_wall_is_not_drawn_to_it() -> None:
     assert not made[:500].any()
 
 
-def test_as_far_along_an_axis_and_on_the_beams() -> None:
-    points = np.array([[1.0, 0.0, 2.0], [3.0, 0.0, 0.1]])
-    step = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.2]])
-    made = View(np.zeros(3), 1.0).as_far_along(points, step, 2)
-    np.testing.assert_allclose(made, [[0.1, 0.0, 0.2], [0.0, 0.0, 0.2]])  # the second beam grazes the layers
-
-
 def test_points_that_were_seen_from_one_place_stay_on_their_beams_and_come_near_to_where_they_were() -> None:
     clean, beams = seen_from(4.0, count=60)
     xyz = along(clean, beams, 0.03)
