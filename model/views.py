@@ -17,7 +17,7 @@ __all__ = ["View", "along_beams"]
 Floats = npt.NDArray[np.float64]
 
 # Seen along its beams a raster is as regular as it was made, however noisy: the logarithm of the distance to the
-# nearest point varies within a patch with a std of 0.00 to 0.02; of even clouds with 0.035 and more, of all others with
+# nearest point varies within a patch with a std of 0.00 to 0.02; of even clouds with 0.023 and more, of all others with
 # 0.1 and more, from wherever these are looked at. Where the eye is near, parallel beams make a little more of it.
 _REGULAR, _REGULAR_ALONG, _REGULAR_SHARE = 0.03, 0.06, 0.75  # the last: of patches
 # Patches that are looked at, and how few will do; their nearest points, and of these the middle.
@@ -181,21 +181,29 @@ def _planes_in_image(patch: Floats, beams: Floats, view: View) -> tuple[Floats, 
 
 @dataclass(frozen=True)
 class _Raster:
-    """Points around a place (n, 3), nearest first, and how far the nearest are from each other in the middle."""
+    """Points around a place, nearest first.
+
+    points: (n, 3); nearest: how far the nearest are from each other in the middle; across_places: (m, m), what takes
+    from values of the m points of the middle what goes with their places.
+    """
 
     points: Floats
     nearest: float
+    across_places: torch.Tensor
 
     @classmethod
     def of(cls, points: Floats) -> _Raster:
-        distances, _ = cKDTree(points).query(points[:_MIDDLE], k=2)
-        return cls(points, float(np.median(distances[:, 1])))
+        middle = points[:_MIDDLE]
+        distances, _ = cKDTree(points).query(middle, k=2)
+        terms = np.linalg.qr(np.column_stack([np.ones(len(middle)), middle - points[0]]))[0]
+        across_places = torch.from_numpy(np.eye(len(middle)) - terms @ terms.T)
+        return cls(points, float(np.median(distances[:, 1])), across_places)
 
     def irregularity(self, view: View) -> float:
         """Return how irregular they are from a view: a std of logarithms, infinite where they lie behind each other."""
         seen = view.image(self.points)
         distances, _ = cKDTree(seen).query(seen[:_MIDDLE], k=2)
-        found = _irregularity(torch.from_numpy(distances[:, 1:]), self._across_places(), self.nearest)
+        found = _irregularity(torch.from_numpy(distances[:, 1:]), self.across_places, self.nearest)
         return float(found[0])
 
     def broadside(self) -> View:
@@ -204,12 +212,11 @@ class _Raster:
 
     def most_regular(self, device: str) -> tuple[float, Floats]:
         """Return how irregular they are along the direction (3,) where they are least so, and that direction."""
-        middle = min(_MIDDLE, len(self.points))
         points = torch.from_numpy((self.points - self.points[0]) / self.nearest).to(device, torch.float32)
-        apart = points[:middle, None] - points
+        apart = points[:_MIDDLE, None] - points
         squared = apart.square().sum(dim=2)
-        squared[range(middle), range(middle)] = torch.inf
-        places = self._across_places().to(device, torch.float32)
+        squared[range(_MIDDLE), range(_MIDDLE)] = torch.inf
+        places = self.across_places.to(device, torch.float32)
 
         def irregularity(directions: torch.Tensor) -> torch.Tensor:  # (m, 3) -> (m,)
             seen = (apart @ directions.T).square_().neg_().add_(squared[:, :, None]).amin(dim=1)
@@ -230,12 +237,6 @@ class _Raster:
         least = found.argmin()
         return float(found[least]), directions[least].double().cpu().numpy()
 
-    def _across_places(self) -> torch.Tensor:
-        """Return what takes from values of the middle points (n, m) what goes with their places: (n, n)."""
-        places = self.points[:_MIDDLE] - self.points[0]
-        terms = np.linalg.qr(np.column_stack([np.ones(len(places)), places]))[0]
-        return torch.from_numpy(np.eye(len(places)) - terms @ terms.T)
-
 
 def _are_regular(rasters: list[_Raster], views: list[View]) -> bool:
     """Say whether most of some rasters are regular, each from its own view."""
@@ -250,7 +251,7 @@ def _are_regular(rasters: list[_Raster], views: list[View]) -> bool:
 def _irregularity(distances: torch.Tensor, across_places: torch.Tensor, nearest: float) -> torch.Tensor:
     """Return half of what lies between one std below and above the middle of the logarithms of (n, m): (m,).
 
-    across_places: (n, n), `_Raster._across_places`: what is far away is seen small; nearest: the distance in space.
+    across_places: (n, n), of `_Raster`: what is far away is seen small; nearest: the distance in space.
     """
     logs = distances.clamp(min=1e-30).log()
     low, high = torch.quantile(across_places @ logs, torch.tensor(_ONE_SIGMA).to(logs), dim=0)
