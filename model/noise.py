@@ -174,11 +174,11 @@ class NoiseReader:
         thickness, width = np.array([thickness_of(positions[rows]) for rows in cut.index]).T
         thin = thickness < _FLAT_RATIO * width
         zoom = zoom_of_flat(noise * scales) if self._zoom else np.ones(len(scales))
-        if (smaller := zoom < 1).any():
+        if (smaller := (zoom < 1) & (thin | raster)).any():
             zoomed = (zoom * scales)[smaller]
             read = self._processor.distances(positions, cut[smaller], zoomed)
             of_zoomed = self.noise_stds(read, zoomed)
-            shown = raster | (thin[smaller] & (thickness[smaller] < _FLAT_PATCH_STDS * of_zoomed))
+            shown = raster | (thickness[smaller] < _FLAT_PATCH_STDS * of_zoomed)
             rows, distances = np.flatnonzero(smaller)[shown], usual.copy()
             scales[rows], distances[rows], noise[rows] = zoomed[shown], read[shown], of_zoomed[shown]
         return ScenePatches(usual, scales, distances, noise, thin & (thickness < _FLAT_PATCH_STDS * noise))

@@ -31,8 +31,9 @@ _ONE_SIGMA = (0.16, 0.84)
 # the point than so many times what a quarter of them are, without such as are more than so many of their stds off it.
 _PLANE_NEIGHBOURS, _BESIDE_DEPTHS, _PLANE_ROUNDS, _OFF_PLANE_STDS = 48, 5.0, 3, 3.5
 # How far that plane is off, beside the noise along the beams; noise stds that a point is off it, or its neighbours are,
-# from where on it lies in no such plane.
-_GRAZING, _ALONE_STDS, _THICK_STDS = 0.1, 3.0, 2.0
+# from where on it lies in no such plane; of a patch's points the share whose neighbours are off their planes by noise
+# alone, however little of it is believed.
+_GRAZING, _ALONE_STDS, _THICK_STDS, _THINNEST = 0.1, 3.0, 2.0, 0.1
 _LEAST = 1e-12  # of lengths in the unit ball
 _STD_OF_MEDIAN, _RIDGE = 1.4826, 1e-9  # of absolute deviations, normal noise; what is added to a singular matrix
 _LEAST_TOWARDS, _NOWHERE = 0.1, 1e9  # cosine of two beams, below which one has no place in the other's image: far away
@@ -144,6 +145,7 @@ def along_beams(step: Floats, patch: Floats, view: View, noise_std: float) -> Fl
     upright = (normals * beams).sum(axis=1, keepdims=True)
     across = (step * normals).sum(axis=1, keepdims=True)
     along = across * upright / (np.square(upright) + _GRAZING**2)
+    noise_std = max(noise_std, float(np.quantile(thickness, _THINNEST)))
     alone = (off > _ALONE_STDS * np.maximum(noise_std, thickness)) | (thickness > _THICK_STDS * noise_std)
     of_none = (step * beams).sum(axis=1, keepdims=True) * beams
     out: Floats = np.where(alone[:, None], of_none, along * beams + (across - along * upright) * normals)

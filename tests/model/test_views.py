@@ -86,7 +86,8 @@ def test_what_lies_behind_one_another_is_no_raster() -> None:
     assert view_of(cells + np.random.default_rng(0).uniform(-0.2, 0.2, (len(cells), 1)) * [0, 0, 1.0]) is None
 
 
-def test_a_step_to_a_leaning_wall_is_made_along_the_beams() -> None:
+@pytest.mark.parametrize(("believed", "left"), [(0.05, 0.004), (0.01, 0.008)])
+def test_a_step_to_a_leaning_wall_is_made_along_the_beams(believed: float, left: float) -> None:
     rng = np.random.default_rng(0)
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 32), np.linspace(-1, 1, 32)))
     eye, normal = np.array([0.0, 0.0, -6.0]), np.array([0.6, 0.0, 0.8])
@@ -95,9 +96,9 @@ def test_a_step_to_a_leaning_wall_is_made_along_the_beams() -> None:
     beams /= np.linalg.norm(beams, axis=1, keepdims=True)
     patch = clean + beams * rng.normal(0, 0.05, (len(clean), 1))
     step = -(patch @ normal)[:, None] * normal + rng.normal(0, 0.03, (len(patch), 1)) * np.array([0.8, 0.0, -0.6])
-    there = patch + along_beams(step, patch, View(eye, 1.0), 0.05)
-    assert np.sqrt(np.mean((there @ normal) ** 2)) < 0.004  # of 0.04
-    assert np.sqrt(np.mean((there - clean) ** 2)) < 0.004
+    there = patch + along_beams(step, patch, View(eye, 1.0), believed)
+    assert np.sqrt(np.mean((there @ normal) ** 2)) < left  # of 0.04
+    assert np.sqrt(np.mean((there - clean) ** 2)) < left
 
 
 def test_what_lies_before_a_wall_is_not_drawn_to_it() -> None:
