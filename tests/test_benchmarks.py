@@ -82,6 +82,27 @@ def test_conditions() -> None:
     assert "WORSE" not in said
 
 
+def test_views(tmp_path: Path) -> None:
+    across = np.linspace(-0.6, 0.6, 50)
+    x, y = (each.ravel() for each in np.meshgrid(across, across))
+    clean = np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=1)
+    ball = {"points": clean, "surface": sphere(20_000), "eye": np.array([0.0, 0.0, 9.0])}
+    ball["normals"] = ball["surface"] / np.linalg.norm(ball["surface"], axis=1, keepdims=True)
+    np.savez(tmp_path / "scans.npz", **{f"ball/{name.replace('points', '2500')}": each for name, each in ball.items()})
+    said = printed("views", tmp_path / "scans.npz", "--noise", 0.02, "--threads", 1)
+    row, mean = said.splitlines()
+    assert row.split(maxsplit=2)[2] == mean.split(maxsplit=2)[2]  # no NO VIEW
+    before, after = (float(value) for value in mean.split("truth")[1].split(",")[0].split("->"))
+    assert after < 0.5 * before
+    assert before == pytest.approx(200, rel=0.1)
+
+
+def test_views_of_an_archive_without_an_eye_are_refused(refused: Refused, tmp_path: Path) -> None:
+    np.savez(tmp_path / "solids.npz", **{"solid000/2500": sphere(2500)})
+    code, said = refused("views", tmp_path / "solids.npz")
+    assert (code, "no scan with an eye" in said) == (1, True)
+
+
 def test_speed() -> None:
     said = printed("speed", "--shape", "sphere", "--resolution", 1000, "--patches", 1, "--threads", 1)
     ours, theirs = (

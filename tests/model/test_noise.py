@@ -23,8 +23,10 @@ class Says:
 
     def __init__(self, far: float, near: float) -> None:
         self.far, self.near = far, near
+        self.asked: list[npt.NDArray[np.int64]] = []  # of which seeds' patches, each time
 
     def distances(self, positions: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
+        self.asked.append(cut.seeds)
         noise = self.far if len(positions) < _POINTS else self.near
         return np.minimum(noise * scales / 0.02, 1.0)  # the default calibration
 
@@ -146,6 +148,22 @@ def test_what_is_flat_in_a_scene_is_shown_smaller_and_so_is_a_raster(*, raster: 
     assert ((shown.scales < 0.9 * usual)[ball] == raster).all()
     np.testing.assert_allclose(shown.noise_stds, noise)  # whatever the size in which it was read
     np.testing.assert_allclose(shown.distances, np.minimum(1, noise * shown.scales / 0.02))
+
+
+@pytest.mark.parametrize("raster", [False, True])
+def test_a_tree_in_a_scene_is_not_read_a_second_time(*, raster: bool) -> None:
+    leaves = np.random.default_rng(1).uniform((-8.5, -0.5, -0.5), (-7.5, 0.5, 0.5), (4000, 3))
+    xyz = np.concatenate([bent_and_flat(), leaves])
+    frame = CloudFrame.of(xyz)
+    positions = frame.enter(xyz)
+    says = Says(0.02 / frame.radius, 0.02 / frame.radius)
+    reader = NoiseReader(says, Calibration(), tile, zoom=True)  # type: ignore[arg-type]
+    (cut,) = tile(positions).cuts()
+    reader.of_scene(positions, cut, raster=raster)
+    (every, again), tree = says.asked, cut.seeds[np.linalg.norm(xyz[cut.seeds] + [8, 0, 0], axis=1) < 0.9]
+    assert len(tree) > 3
+    assert np.isin(tree, every).all()
+    assert (np.isin(tree, again) == raster).all()
 
 
 def test_without_zoom_a_scenes_patches_have_the_usual_size() -> None:
