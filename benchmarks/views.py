@@ -25,7 +25,7 @@ from straightpcf.model.objects import begin
 from straightpcf.model.run import Run
 from straightpcf.model.train.archive import opened, read_array
 from straightpcf.model.train.data import along_beams
-from straightpcf.points.errors import InvalidOptions
+from straightpcf.points.errors import InvalidOptions, MalformedFile
 from straightpcf.points.options import DenoiseOptions
 
 Floats = npt.NDArray[np.float64]
@@ -91,13 +91,17 @@ class _Scan:
 def _scans(archive: Path, shapes: list[str] | None, points: int) -> dict[str, _Scan]:
     with opened(archive) as file:
         names = sorted({name.partition("/")[0] for name in file.files if name.endswith("/eye")})
-        if unknown := sorted(set(shapes or names) - set(names)) or not names:
-            raise InvalidOptions(f"{archive} has no scan {unknown if names else 'with an eye'}")
+        if not names:
+            raise InvalidOptions(f"{archive} has no scan with an eye")
+        if unknown := sorted(set(shapes or names) - set(names)):
+            raise InvalidOptions(f"{archive} has no scan {', '.join(unknown)}; there are {', '.join(names)}")
         return {name: _read(file, archive, name, points) for name in shapes or names}
 
 
 def _read(file: np.lib.npyio.NpzFile, archive: Path, name: str, points: int) -> _Scan:
     counts = [int(count) for each in file.files if (count := each.removeprefix(f"{name}/")).isdigit()]
+    if not counts:
+        raise MalformedFile(f"{archive}: {name} has an eye and no points")
     nearest = min(counts, key=lambda count: abs(count - points))
     cloud, eye, surface, normals = (
         read_array(file, f"{name}/{what}", archive).astype(np.float64)

@@ -70,9 +70,9 @@ class Reading:
     scene's points have, or less; most_on_surfaces: what is believed of any place of a scene by a few neighbours, before
     the first pass; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
     uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud; view: the place that the cloud was seen from, None where its points are no raster
-    of beams; probes: the patches that were read; thickness: of the surface that a pass has left of dense points, the
-    median of the std of each point's nearest across their plane by the lesser one along it.
+    raster, None of any other cloud; view: the place that the cloud was seen from, before the first pass, None where its
+    points are no raster of beams; probes: the patches that were read; thickness: of the surface that a pass has left of
+    dense points, the median of the std of each point's nearest across their plane by the lesser one along it.
     """
 
     distance: float
@@ -133,7 +133,7 @@ class NoiseReader:
     def read(self, positions: Floats, tiling: Tiling, first: Reading | None, *, view: View | None = None) -> Reading:
         """Read the noise of a cloud; first: the reading before the first pass, None where this is it.
 
-        view: the place that it was seen from, where that is known.
+        view: the place that it was seen from, where that is known before the first pass.
 
         What is a scene is said once: patches shrink as the noise goes. Where the pass shows the whole cloud in another
         size than that of the reading, d is read in that size, too.
@@ -146,9 +146,9 @@ class NoiseReader:
             radii = (_quantile(probes.radii, probes.owned, share) for share in (0.1, 0.5, 0.9))
             scene = axis is not None or is_scene(*radii)
         else:
-            axis, scene, view = first.height_axis, first.scene, first.view
+            axis, scene = first.height_axis, first.scene
         if scene:
-            reading = self._read_scene(positions, tiling, probes, axis, view, first=first is None)
+            reading = replace(self._read_scene(positions, tiling, probes, axis, first=first is None), view=view)
             settled = first is not None or axis is not None or not self._zoom
             if settled or not is_dense_object(reading.noise_std, probes.radii, len(positions)):
                 return reading
@@ -253,8 +253,7 @@ class NoiseReader:
         if self._zoom and first.high_noise and noise > _REREAD_FROM * self._largest_noise:
             zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
         distance = float(np.median(distances))
-        view = first.view
-        return Reading(distance, noise, False, first.sampling, zoom, view=view, probes=probes, thickness=thickness)
+        return Reading(distance, noise, False, first.sampling, zoom, probes=probes, thickness=thickness)
 
     def _reread(self, positions: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""
@@ -269,7 +268,7 @@ class NoiseReader:
         return noise
 
     def _read_scene(
-        self, positions: Floats, tiling: Tiling, probes: Patches, axis: int | None, view: View | None, *, first: bool
+        self, positions: Floats, tiling: Tiling, probes: Patches, axis: int | None, *, first: bool
     ) -> Reading:
         """Read the noise std of half of a scene's points and of most, and in how many parts the pass filters it."""
         raster = axis is not None
@@ -293,7 +292,6 @@ class NoiseReader:
             noise_of_most=noise_of_most,
             most_on_surfaces=most_on_surfaces,
             height_axis=axis,
-            view=view,
             probes=probes,
         )
 

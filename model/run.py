@@ -351,7 +351,7 @@ class Run:
             trusted_noise=limit,
             most_on_surfaces=self.readings[0].most_on_surfaces,
             height_axis=reading.height_axis,
-            view=reading.view,
+            view=self.readings[0].view,
             noise_std=self.readings[0].noise_std,
         )
         return owned, step, held_back
