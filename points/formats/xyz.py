@@ -259,7 +259,7 @@ def _are_normals(normals: npt.NDArray[np.float64]) -> bool:
 
 def _has_decimal_comma(text: bytes, delimiter: bytes | None) -> bool:
     """Say whether a cell looks like 0,5, or, where commas were taken for delimiters, like what is between two such."""
-    return re.fullmatch(rb"\d+(\s+[+-]?\d+)+" if delimiter == b"," else rb"[+-]?\d+,\d+", text) is not None
+    return re.fullmatch(rb"[+-]?\d+,\d+" + (rb"|\d+(\s+[+-]?\d+)+" if delimiter == b"," else b""), text) is not None
 
 
 def _refuse_decimal_commas(raw: bytes, line: int) -> None:

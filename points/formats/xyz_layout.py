@@ -23,6 +23,7 @@ _SEPARATOR = re.compile(rb'"?sep=.?"?', re.IGNORECASE)  # Excel's first line; th
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
+_DECIMAL_COMMAS = re.compile(rb"[+-]?\d+(?:,\d+)?(?:\s+[+-]?\d+(?:,\d+)?){2,}")  # 0,5 1 2,5: not between commas
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,10 @@ def _described(
     marks: Sequence[bytes],
 ) -> Layout:
     cells = words_of(row, marks=marks)
+    delimiter = delimiter_of(row, marks)
+    # Without names, and with cells enough, the first cell that is no number says so.
+    if (names is not None or len(cells) < 3) and delimiter == b"," and _DECIMAL_COMMAS.fullmatch(row):
+        raise MalformedFile(f"line {line} has decimal commas: {shown(row)}; decimals have a point here, no comma")
     if len(cells) < 3:
         raise MalformedFile(f"line {line} has {len(cells)} columns, a point needs three: {shown(row)}")
     if len(cells) > MAX_COLUMNS:
@@ -96,7 +101,7 @@ def _described(
     if declared is not None and labels[0] == "column_1" and len(labels) in PTS_COLUMNS:
         labels = (*AXES, *PTS_COLUMNS[len(labels)])
     is_named = axes is not None or declared is not None
-    return Layout(begin, line, declared, delimiter_of(row, marks), labels, axes or (0, 1, 2), is_named)
+    return Layout(begin, line, declared, delimiter, labels, axes or (0, 1, 2), is_named)
 
 
 def _are_names(text: bytes, marks: Sequence[bytes]) -> bool:
