@@ -31,12 +31,13 @@ def watch_folder(
 
     A result gets the time of its input as it was before it was read: an input that is replaced meanwhile, even by an
     older file, is seen to be another. A namesake that was written after its input came is let be, too: somebody may
-    have worked on a result. A file is taken when its size and time have not changed for a second, so that one
-    which is still being written is left alone; one that failed is tried again when it changes, or, where only the
-    server could not be had, at the next look, or, where the disk was full or `target` away, when more of it is free
-    or it is back. A server that has lost a job, with its data, gets it once more. A `folder` that is away, as a share
-    may be, is said once, and waited for. Yields each outcome. once: look once, and end. Raises Unauthorized: what a
-    server that wants another key says of one file it says of all.
+    have worked on a result. A file is taken when its size and time have not changed for a second, so that one which is
+    still being written is left alone; one that failed is tried again when it changes, or, where only the server could
+    not be had, at the next look, or, where the disk was full or `target` away, when more of it is free or it is back,
+    or, where it may not be read or `target` not be written into, when it may. A server that has lost a job, with its
+    data, gets it once more. A `folder` that is away, as a share may be, is said once, and waited for. Yields each
+    outcome. once: look once, and end. Raises Unauthorized: what a server that wants another key says of one file it
+    says of all.
     """
     looks, is_away = _Looks(target, denoise, once=once), False
     while True:
@@ -63,6 +64,7 @@ class _Looks:
         self._target, self._denoise, self._once = target, denoise, once
         self._tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
         self._full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
+        self._shut: set[Path] = set()
         self._lost: dict[Path, Stamp] = {}
         self._before: dict[Path, Stamp] = {}
 
@@ -79,6 +81,9 @@ class _Looks:
             return None
         if _is_full(self._target, self._full.get(path)):
             return None
+        if path in self._shut and _is_shut(path, self._target):
+            return None
+        self._shut.discard(path)
         if self._once:
             return _stamp(path)
         # It may still grow, and its turn may come long after the look.
@@ -106,6 +111,8 @@ class _Looks:
             self._full[path] = shutil.disk_usage(self._target).free
         elif not self._target.is_dir():
             self._full[path] = -1
+        elif isinstance(error, OSError) and _is_shut(path, self._target):
+            self._shut.add(path)
         elif _stamp(path) is not None:  # else it is gone, or its folder is away: it may come back as it was
             self._tried[path] = stamp
 
@@ -130,6 +137,11 @@ def _stamp(path: Path) -> Stamp | None:
 
 def _is_full(target: Path, free: int | None) -> bool:
     return free is not None and (not target.is_dir() or shutil.disk_usage(target).free <= free)
+
+
+def _is_shut(path: Path, target: Path) -> bool:
+    """Tell whether this process may not read a cloud, or not write into `target`."""
+    return not (os.access(path, os.R_OK) and os.access(target, os.W_OK))
 
 
 def _is_done(path: Path, result: Path, stamp: Stamp) -> bool:

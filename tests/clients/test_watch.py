@@ -222,6 +222,33 @@ def test_a_full_disk_is_tried_again_when_more_of_it_is_free(folder: Path, monkey
     assert asked == [100, 5000]
 
 
+@pytest.mark.parametrize(
+    ("shut", "code"), [("scan.ply", errno.EACCES), ("clean", errno.EACCES), ("clean", errno.EROFS)]
+)
+def test_what_may_not_be_read_or_written_is_said_once_and_tried_again_when_it_may(
+    shut: str, code: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    access, is_shut = os.access, True  # root may read and write everything
+    monkeypatch.setattr(
+        watch.os, "access", lambda path, mode: not (is_shut and path.name == shut) and access(path, mode)
+    )
+
+    def denoise(source: Path, target: Path) -> str:
+        if is_shut:
+            raise OSError(code, os.strerror(code), shut)
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert getattr(next(outcomes), "errno", None) == code
+
+    def opened() -> None:  # as by chmod or a mount, of which neither size nor time tells
+        nonlocal is_shut
+        is_shut = False
+
+    threading.Timer(0.1, opened).start()  # while it looks, some ten times
+    assert next(outcomes) == "first"
+
+
 def test_a_folder_for_results_that_goes_away_and_comes_back_is_no_failure_of_the_file(folder: Path) -> None:
     (folder / "clean").rmdir()
     outcomes = watched(folder, copy)
