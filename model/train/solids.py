@@ -36,9 +36,10 @@ from straightpcf.model.train.primitives import (
     pose,
 )
 
-__all__ = ["FAMILIES", "KINDS", "RESOLUTIONS", "write_solids"]
+__all__ = ["FAMILIES", "KINDS", "RESOLUTIONS", "even_clouds", "write_solids"]
 
 Floats = npt.NDArray[np.float64]
+Sample = Callable[[np.random.Generator, int], tuple[Floats, Floats]]
 
 RESOLUTIONS = (10_000, 30_000, 50_000)
 # Of so many times the points wanted, the farthest from each other are kept: spacings are then as even as PUNet's (the
@@ -61,21 +62,37 @@ def write_solids(
         raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, wanted))}")
     if kind not in KINDS:
         raise ValueError(f"kinds are {', '.join(KINDS)}, not {kind}")
-    arrays, families = {}, KINDS[kind]
+    arrays: dict[str, npt.NDArray[np.float32]] = {}
+    families = KINDS[kind]
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         # Every family in turn: as many of each.
-        xyz, normals = families[number % len(families)](rng).sample(rng, _CANDIDATES * max(RESOLUTIONS))
-        xyz = CloudFrame.of(xyz).enter(xyz)
-        for resolution in RESOLUTIONS:
-            some = rng.permutation(len(xyz))[: _CANDIDATES * resolution]
-            kept = some[fpsample.bucket_fps_kdline_sampling(xyz[some].astype(np.float32), resolution, 7, 0)]
-            if resolution in wanted:
-                arrays[f"{kind}{number:03d}/{resolution}"] = xyz[kept].astype(np.float32)
-        if resolution not in wanted:
-            arrays[f"{kind}{number:03d}/surface"] = xyz[kept].astype(np.float32)
-        arrays[f"{kind}{number:03d}/normals"] = normals[kept].astype(np.float32)
+        made = families[number % len(families)](rng)
+        arrays |= even_clouds(rng, f"{kind}{number:03d}", made.sample, wanted)
     write_archive(path, arrays, save=np.savez_compressed)
+
+
+def even_clouds(
+    rng: np.random.Generator, shape: str, sample: Sample, wanted: Collection[int] | None = None
+) -> dict[str, npt.NDArray[np.float32]]:
+    """Return a shape's arrays for an archive, as `write_solids` has them.
+
+    sample: draws so many points by area, (M, 3), and their normals. wanted: those of RESOLUTIONS to train on, all by
+    default.
+    """
+    arrays: dict[str, npt.NDArray[np.float32]] = {}
+    wanted = RESOLUTIONS if wanted is None else wanted
+    xyz, normals = sample(rng, _CANDIDATES * max(RESOLUTIONS))
+    xyz = CloudFrame.of(xyz).enter(xyz)
+    for resolution in RESOLUTIONS:
+        some = rng.permutation(len(xyz))[: _CANDIDATES * resolution]
+        kept = some[fpsample.bucket_fps_kdline_sampling(xyz[some].astype(np.float32), resolution, 7, 0)]
+        if resolution in wanted:
+            arrays[f"{shape}/{resolution}"] = xyz[kept].astype(np.float32)
+    if resolution not in wanted:
+        arrays[f"{shape}/surface"] = xyz[kept].astype(np.float32)
+    arrays[f"{shape}/normals"] = normals[kept].astype(np.float32)
+    return arrays
 
 
 def _wall(rng: np.random.Generator) -> float:
