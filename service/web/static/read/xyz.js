@@ -29,12 +29,14 @@ const UNIT = /\s*(\[.*\]|\(.*\))$/;
 const BEFORE_UNIT = /(?<!\s)\s+(?=[[(])/g;
 const LEAD = /^[^,;\t:]*:\s+/; // columns: x y z
 const PAIRS = /^[ \t-\r]*[-+]?\d+,\d+(,[ \t-\r]*[-+]?\d+,\d+){2,}[ \t-\r]*$/; // 0,5, 1,5, 2,5
+const DECIMAL_COMMAS = /^[-+]?\d+(,\d+)?([ \t-\r]+[-+]?\d+(,\d+)?){2,}$/; // 0,5 1 2,5: not between commas
 const SEPARATOR = /^"?sep=.?"?$/i; // Excel's first line
 const REMARKS = 20; // the last comments above a table, of which one may be its title
 const COUNTED = 10; // points: of fewer, an x may go up by one each
 const LOOKED_AT = 1 << 14; // bytes of the first rows, which tell decimal commas from cells
 const TAB = 9;
 const COMMA = 44;
+const NO_COMMA = "decimals have a point here, no comma";
 const UNKNOWN_NAMES = "names that do not say x, y, z";
 
 export function readXyz(bytes, marks = MARKS) {
@@ -93,7 +95,7 @@ export function readXyz(bytes, marks = MARKS) {
     row(text, start, end);
   });
   if (numbered) decide("");
-  if (pairs?.areDecimals) throw new Error("decimals have a point here, no comma");
+  if (pairs?.areDecimals) throw new Error(NO_COMMA);
   if (counting?.isRefused) throw new Error("the first column counts the points, and nothing says which are x, y, z");
   if (numbering?.isRefused) throw new Error("the first columns number rows and columns, and nothing says which are x, y, z");
   return rows.xyz;
@@ -181,6 +183,7 @@ class Pairs {
 function layout(line, names, remarks, marks) {
   const cells = words(line, marks);
   const delimiter = (delimiterOf(line, marks) ?? "\0").charCodeAt(0);
+  if ((names || cells.length < 3) && delimiter === COMMA && DECIMAL_COMMAS.test(line)) throw new Error(NO_COMMA);
   for (const title of [names, ...remarks]) {
     const fitting = meant(title, marks).map((labels) => fitted(labels, cells)).filter((labels) => labels !== null);
     const axes = fitting.map(axesOf).find((found) => found !== null);
