@@ -26,7 +26,7 @@ from straightpcf.points.errors import InvalidOptions, MalformedFile, MissingDepe
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-__all__ = ["SUFFIXES", "why_not", "write_meshes"]
+__all__ = ["SUFFIXES", "write_meshes"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def write_meshes(path: Path, meshes: Sequence[Path], *, seed: int = 0) -> dict[P
     left_out: dict[Path, str] = {}
     for shape, file in files.items():
         mesh = _read(file)
-        if why := why_not(mesh):
+        if why := _why_not(mesh):
             left_out[file] = why
             continue
         arrays |= even_clouds(np.random.default_rng([seed, len(arrays)]), shape, partial(_sample, mesh))
@@ -58,15 +58,6 @@ def write_meshes(path: Path, meshes: Sequence[Path], *, seed: int = 0) -> dict[P
         raise InvalidOptions("none of the meshes is a single closed body: " + "; ".join(_told(left_out)))
     write_archive(path, arrays, save=np.savez_compressed)
     return left_out
-
-
-def why_not(mesh: Trimesh) -> str | None:
-    """Say why a mesh is nothing to train on, if it is not; its vertices that lie in one place are one."""
-    if not mesh.is_watertight:
-        return "its surface is not closed"
-    if (bodies := mesh.body_count) > 1:
-        return f"it is {bodies} bodies"
-    return None
 
 
 def _read(path: Path) -> Trimesh:
@@ -84,6 +75,15 @@ def _read(path: Path) -> Trimesh:
     if not mesh.area > 0:  # NaN, too
         raise MalformedFile(f"{path} holds no triangles with an area")
     return mesh
+
+
+def _why_not(mesh: Trimesh) -> str | None:
+    """Say why a mesh is nothing to train on, if it is not; its vertices that lie in one place are one."""
+    if not mesh.is_watertight:
+        return "its surface is not closed"
+    if (bodies := mesh.body_count) > 1:
+        return f"it is {bodies} bodies"
+    return None
 
 
 def _sample(mesh: Trimesh, rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:

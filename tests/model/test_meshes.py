@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from straightpcf.model.train import meshes, solids
 from straightpcf.model.train.data import PatchSource
 from straightpcf.model.train.meshes import SUFFIXES, write_meshes
-from straightpcf.points.errors import InvalidOptions, MalformedFile
+from straightpcf.points.errors import InvalidOptions, MalformedFile, MissingDependency
 
 
 @pytest.fixture(autouse=True)
@@ -82,3 +82,9 @@ def test_files_that_cannot_be_taken_are_named(tmp_path: Path) -> None:
         assert f"empty{suffix}" in said(MalformedFile, f"empty{suffix}")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False).export(tmp_path / "line.ply")
     assert "holds no triangles with an area" in said(MalformedFile, "line.ply")
+
+
+def test_without_trimesh_the_extra_that_has_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trimesh", None)  # what an import finds where there is none
+    with pytest.raises(MissingDependency, match=r"straightpcf\[train\]"):
+        write_meshes(tmp_path / "out.npz", [tmp_path / "ball.stl"])
