@@ -64,7 +64,7 @@ class _Looks:
         self._target, self._denoise, self._once = target, denoise, once
         self._tried: dict[Path, Stamp] = {}  # the done ones too: not every file system keeps the time that it is told
         self._full: dict[Path, int] = {}  # bytes that were free when they were not enough, -1 where there was no folder
-        self._shut: set[Path] = set()
+        self._shut: set[Path] = set()  # which this process might not read, or whose result it might not write
         self._lost: dict[Path, Stamp] = {}
         self._before: dict[Path, Stamp] = {}
 

@@ -57,9 +57,8 @@ def write_solids(
     the bounding sphere has radius 1. resolutions: those of RESOLUTIONS to train on, all by default; without the finest,
     that is `solid<number>/surface`. kind: another one of KINDS, and its name. Raises ValueError for others of either.
     """
-    wanted = RESOLUTIONS if resolutions is None else resolutions
-    if not wanted or not set(wanted) <= set(RESOLUTIONS):
-        raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, wanted))}")
+    if resolutions is not None and (not resolutions or not set(resolutions) <= set(RESOLUTIONS)):
+        raise ValueError(f"resolutions are {', '.join(map(str, RESOLUTIONS))}, not {', '.join(map(str, resolutions))}")
     if kind not in KINDS:
         raise ValueError(f"kinds are {', '.join(KINDS)}, not {kind}")
     arrays: dict[str, npt.NDArray[np.float32]] = {}
@@ -68,7 +67,7 @@ def write_solids(
         rng = np.random.default_rng([seed, number])
         # Every family in turn: as many of each.
         made = families[number % len(families)](rng)
-        arrays |= even_clouds(rng, f"{kind}{number:03d}", made.sample, wanted)
+        arrays |= even_clouds(rng, f"{kind}{number:03d}", made.sample, resolutions)
     write_archive(path, arrays, save=np.savez_compressed)
 
 

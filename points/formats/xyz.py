@@ -27,7 +27,7 @@ from straightpcf.points.formats.text import (
     shown,
 )
 from straightpcf.points.formats.titles import MARKS, MAX_COLUMNS
-from straightpcf.points.formats.xyz_layout import PTS_COLUMNS, Layout, read_layout
+from straightpcf.points.formats.xyz_layout import NO_COMMA, PTS_COLUMNS, Layout, read_layout
 
 __all__ = ["Csv", "Pts", "Tsv", "Xyz"]
 
@@ -232,7 +232,7 @@ def _column(table: Lines, column: int, layout: Layout, numbers: _Offsets) -> npt
     if column not in layout.axes:
         return None
     text = table.raw[begins[bad] : stops[bad]]
-    hint = "; decimals have a point here, no comma" if _has_decimal_comma(text, layout.delimiter) else ""
+    hint = f"; {NO_COMMA}" if _has_decimal_comma(text, layout.delimiter) else ""
     raise MalformedFile(f"line {numbers[bad]}, column {column + 1}: {shown(text)} is no number{hint}")
 
 
@@ -278,8 +278,7 @@ def _refuse_decimal_commas(raw: bytes, line: int) -> None:
     )
     if are_apart or are_alike:
         raise MalformedFile(
-            f"line {line} looks like numbers with decimal commas between commas: {shown(rows[0].strip())}; "
-            "decimals have a point here, no comma"
+            f"line {line} looks like numbers with decimal commas between commas: {shown(rows[0].strip())}; {NO_COMMA}"
         )
 
 

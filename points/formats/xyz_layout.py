@@ -13,7 +13,7 @@ from straightpcf.points.formats.positions import AXES
 from straightpcf.points.formats.text import as_number, is_missing, shown
 from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, names_axes, words_of
 
-__all__ = ["PTS_COLUMNS", "Layout", "read_layout"]
+__all__ = ["NO_COMMA", "PTS_COLUMNS", "Layout", "read_layout"]
 
 MAX_LINES_ABOVE = 100_000  # they are read one by one: a tenth of a second
 # What stands behind x, y, z in a .pts file of so many columns.
@@ -21,6 +21,7 @@ PTS_COLUMNS = {4: ("intensity",), 6: RGB, 7: ("intensity", *RGB)}
 _COMMENTS = (b"#", b"//")
 _SEPARATOR = re.compile(rb'"?sep=.?"?', re.IGNORECASE)  # Excel's first line; the rows say it, too
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
+NO_COMMA = "decimals have a point here, no comma"
 _BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _DECIMAL_COMMAS = re.compile(rb"[+-]?\d+(?:,\d+)?(?:\s+[+-]?\d+(?:,\d+)?){2,}")  # 0,5 1 2,5: not between commas
@@ -92,7 +93,7 @@ def _described(
     delimiter = delimiter_of(row, marks)
     # Without names, and with cells enough, the first cell that is no number says so.
     if (names is not None or len(cells) < 3) and delimiter == b"," and _DECIMAL_COMMAS.fullmatch(row):
-        raise MalformedFile(f"line {line} has decimal commas: {shown(row)}; decimals have a point here, no comma")
+        raise MalformedFile(f"line {line} has decimal commas: {shown(row)}; {NO_COMMA}")
     if len(cells) < 3:
         raise MalformedFile(f"line {line} has {len(cells)} columns, a point needs three: {shown(row)}")
     if len(cells) > MAX_COLUMNS:
