@@ -69,6 +69,11 @@ def test_what_a_client_asks_for_is_read_as_rfc_9110_has_it(header: str, asked: b
         ("b/patches;q=0.4, a/json;q=0.5", True),
         ("b/patches", False),
         ("a/json;q=0, b/patches;q=0", False),
+        ("a/json;q=0.1, */*", False),
+        ("a/json, */*", True),
+        ("a/json;q=0.5, b/*;q=0.4, */*", True),  # the narrowest that fits counts
+        ("b/patches;q=0.4, a/json;q=0.5, B/*, */*", True),
+        ("a/json;q=0.5, a/*;q=0.9", True),
     ],
 )
 def test_of_two_forms_the_one_with_more_weight_is_sent(header: str, asked: bool) -> None:
