@@ -7,6 +7,7 @@ import os
 import shutil
 import stat
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from straightpcf.points.formats import FORMATS
 __all__ = ["watch_folder"]
 
 LOOK_SECONDS = 1.0
+MOST_LOOKS = 8  # that one waits for a server that is away
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+_AWAY = (ConnectionFailed, RequestTimeout, ServerBusy)
 _SUFFIXES = frozenset(suffix for format in FORMATS for suffix in format.suffixes)
 
 Outcome = tuple[Path, Any | Exception]
@@ -33,11 +36,11 @@ def watch_folder(
     older file, is seen to be another. A namesake that was written after its input came is let be, too: somebody may
     have worked on a result. A file is taken when its size and time have not changed for a second, so that one which is
     still being written is left alone; one that failed is tried again when it changes, or, where only the server could
-    not be had, at the next look, or, where the disk was full or `target` away, when more of it is free or it is back,
-    or, where it may not be read or `target` not be written into, when it may. A server that has lost a job, with its
-    data, gets it once more. A `folder` that is away, as a share may be, is said once, and waited for. Yields each
-    outcome. once: look once, and end. Raises Unauthorized: what a server that wants another key says of one file it
-    says of all.
+    not be had, which is said once, at a later look, or, where the disk was full or `target` away, when more of it is
+    free or it is back, or, where it may not be read or `target` not be written into, when it may. A server that has
+    lost a job, with its data, gets it once more. A `folder` that is away, as a share may be, is said once, and waited
+    for. Yields each outcome. once: look once, and end. Raises Unauthorized: what a server that wants another key says
+    of one file it says of all.
     """
     looks, is_away = _Looks(target, denoise, once=once), False
     while True:
@@ -54,7 +57,7 @@ def watch_folder(
             yield from looks.take(seen)
             if once:
                 return
-        time.sleep(LOOK_SECONDS)
+        time.sleep(LOOK_SECONDS * looks.until_next)
 
 
 class _Looks:
@@ -67,12 +70,29 @@ class _Looks:
         self._shut: set[Path] = set()  # which this process might not read, or whose result it might not write
         self._lost: dict[Path, Stamp] = {}
         self._before: dict[Path, Stamp] = {}
+        self._missed: Counter[Path] = Counter()  # how often each did not find the server
+        self._said: set[str] = set()  # of a server that is away
+        self.until_next = 1  # in LOOK_SECONDS; twice as long after each look at which the server was away
 
     def take(self, seen: dict[Path, Stamp]) -> Iterator[Outcome]:
-        """Denoise those of the clouds in a folder whose turn it is."""
-        for path, stamp in seen.items():
-            if (current := self._stamp_to_take(path, stamp)) is not None:
-                yield path, self._outcome(path, current)
+        """Denoise those of the clouds in a folder whose turn it is, until one does not find the server.
+
+        The next look begins with another one: it may be that this one alone is cut off on its way.
+        """
+        is_away = False
+        for path, stamp in sorted(seen.items(), key=lambda item: self._missed[item[0]]):
+            if (current := self._stamp_to_take(path, stamp)) is None:
+                continue
+            outcome = self._outcome(path, current)
+            is_away = isinstance(outcome, _AWAY) and not self._once
+            if not is_away or str(outcome) not in self._said:
+                yield path, outcome
+            if is_away:
+                self._missed[path] += 1
+                self._said.add(str(outcome))
+                break
+            self._said.clear()
+        self.until_next = min(2 * self.until_next, MOST_LOOKS) if is_away else 1
         self._before = seen
 
     def _stamp_to_take(self, path: Path, stamp: Stamp) -> Stamp | None:
@@ -103,7 +123,7 @@ class _Looks:
         return report
 
     def _note_failure(self, path: Path, stamp: Stamp, error: Exception) -> None:
-        if isinstance(error, ConnectionFailed | RequestTimeout | ServerBusy):
+        if isinstance(error, _AWAY):
             return
         if isinstance(error, NotFound | JobExpired) and self._lost.get(path) != stamp:
             self._lost[path] = stamp

@@ -54,7 +54,7 @@ class HttpTransport(Transport):
                     attempts.failure = receiver.finish()
                 else:
                     response.read()
-                    attempts.failure = failed_response(response)
+                    attempts.failure = failed_response(response, self._url)
         except _FAULTS as fault:
             attempts.failure = failed_connection(fault, self._url)
 
@@ -88,7 +88,7 @@ class AsyncHttpTransport(AsyncTransport):
                     attempts.failure = receiver.finish()
                 else:
                     await response.aread()
-                    attempts.failure = failed_response(response)
+                    attempts.failure = failed_response(response, self._url)
         except _FAULTS as fault:
             attempts.failure = failed_connection(fault, self._url)
 

@@ -18,11 +18,13 @@ from straightpcf.points.errors import (
     ServerBusy,
     StraightPCFError,
     TooManyBytes,
+    Unauthorized,
 )
 
 __all__ = ["Health", "ServerInfo", "failed_connection", "failed_response", "parse_health", "parse_info"]
 
 _GATEWAY = (502, 503, 504)  # of a proxy, whose server is gone or restarted: what ours says of itself has a code
+_ELSEWHERE = (404, 405, 501)  # of what knows nothing of ours: a proxy without its route, files that take no PUT
 # A request that may have reached the server is sent again only because every one of ours is idempotent.
 _RETRYABLE_FAULTS = (
     httpx2.NetworkError, httpx2.TimeoutException, httpx2.RemoteProtocolError, httpx2.SSEError, httpx2.DecodingError,
@@ -79,17 +81,17 @@ def parse_info(body: Mapping[str, Any]) -> ServerInfo:
     )
 
 
-def failed_response(response: httpx2.Response) -> Failure:
-    """Turn an error response, its body read, into the error that has its code."""
+def failed_response(response: httpx2.Response, url: object) -> Failure:
+    """Turn an error response, its body read, into the error that has its code; url: of the server that was asked."""
     problem = _problem(response)
     request_id = problem.get("request_id") or response.headers.get("X-Request-Id")
     kind = ERRORS_BY_CODE.get(str(problem.get("code")), _kind_of_status(response.status_code))
-    told = f"HTTP {response.status_code} {response.reason_phrase}"
+    told = f"{url}: HTTP {response.status_code} {response.reason_phrase}"
     if response.is_redirect and (place := response.headers.get("Location")):
         told += f" to {place[:200]}: give the address that it ends at"
     else:
         told += ", of a proxy or another server"
-    detail = str(problem.get("detail") or told)
+    detail = str(problem.get("detail") or told) if "code" in problem else told
     return Failure(
         error=kind(detail, request_id=request_id),
         retryable=bool(problem.get("retryable", response.status_code in (429, *_GATEWAY))),
@@ -116,8 +118,10 @@ def _kind_of_status(status: int) -> type[StraightPCFError]:
         return TooManyBytes
     if status == 429:
         return ServerBusy
-    if status in _GATEWAY:
+    if status in _GATEWAY + _ELSEWHERE:
         return ConnectionFailed
+    if status == 401:
+        return Unauthorized
     return InvalidRequest if 300 <= status < 500 else InternalError
 
 

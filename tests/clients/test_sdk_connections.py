@@ -30,6 +30,7 @@ from straightpcf.points.errors import (
     NotFound,
     ServerBusy,
     TooManyBytes,
+    Unauthorized,
 )
 from tests.clouds import noisy, torus
 from tests.conftest import RunningServer
@@ -235,12 +236,22 @@ def test_a_key_beside_a_password_in_the_url_is_refused_as_it_would_not_be_sent()
         assert "secret" not in str(found.value)
 
 
-def test_an_error_of_a_proxy_is_not_taken_for_the_servers() -> None:
-    for status, kind in (("413 Request Entity Too Large", TooManyBytes), ("502 Bad Gateway", ConnectionFailed)):
-        page = canned(status, "<html>nginx</html>", "Content-Type: text/html")
-        refused = pytest.raises(kind, match=f"HTTP {status}, of a proxy")
-        with answering(page) as (url, _), Client(url, max_retries=0) as client, refused:
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        ("413 Request Entity Too Large", TooManyBytes),
+        ("502 Bad Gateway", ConnectionFailed),
+        ("404 Not Found", ConnectionFailed),  # a server is not there: of a job of ours it says nothing
+        ("405 Method Not Allowed", ConnectionFailed),
+        ("401 Unauthorized", Unauthorized),
+    ],
+)
+@pytest.mark.parametrize("page", ["<html>nginx</html>", '{"detail":"Not Found"}'])
+def test_an_error_of_a_proxy_is_not_taken_for_the_servers(status: str, kind: type[Exception], page: str) -> None:
+    with answering(canned(status, page)) as (url, _), Client(url, max_retries=0) as client:
+        with pytest.raises(kind, match=f"{url}: HTTP {status}, of a proxy") as found:
             client.health()
+        assert type(found.value) is kind
 
 
 def test_a_page_that_a_proxy_sends_for_a_result_is_not_taken_for_one(server: RunningServer, tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_a_file_system_that_keeps_no_exact_times_does_not_make_it_go_on_for_ever
 
 @pytest.mark.parametrize("away", [ConnectionFailed("down"), RequestTimeout("slow"), ServerBusy("full")])
 def test_a_server_that_cannot_be_had_is_no_failure_of_the_file(folder: Path, away: Exception) -> None:
-    answers = iter([away, away, None])
+    answers = iter([away, away, away, None, away, None])
 
     def denoise(source: Path, target: Path) -> str:
         if (error := next(answers)) is not None:
@@ -137,7 +137,26 @@ def test_a_server_that_cannot_be_had_is_no_failure_of_the_file(folder: Path, awa
         return copy(source, target)
 
     outcomes = watched(folder, denoise)
-    assert [next(outcomes) for _ in range(3)] == [away, away, "first"]
+    assert [next(outcomes), next(outcomes)] == [away, "first"]  # said once
+    replace(folder / "scan.ply", b"second", age=-5.0)
+    assert [next(outcomes), next(outcomes)] == [away, "second"]
+
+
+def test_of_many_files_one_a_look_finds_a_server_away_and_in_the_next_another(folder: Path) -> None:
+    for name in ("a.ply", "b.ply"):
+        (folder / name).write_bytes(name.encode())
+    asked: list[str] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(source.name)
+        if len(asked) < 5 or source.name == "a.ply":  # that one is always cut off on its way
+            raise ConnectionFailed("down")
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert [str(next(outcomes)) for _ in range(3)] == ["down", "b.ply", "first"]
+    assert asked == ["a.ply", "b.ply", "scan.ply", "a.ply", "b.ply", "scan.ply"]
+    assert [str(outcome) for outcome in once(folder, denoise)] == ["down"]
 
 
 @pytest.mark.parametrize("lost", [NotFound("no such job"), JobExpired("removed")])
