@@ -99,7 +99,7 @@ class _Looks:
         """Return the stamp of a cloud as it is now, None where it is not its turn."""
         if self._tried.get(path) == stamp or _is_done(path, self._target / path.name, stamp):
             return None
-        if _is_full(self._target, self._full.get(path)):
+        if path in self._full and _free(self._target) <= self._full[path]:
             return None
         if path in self._shut and _is_shut(path, self._target):
             return None
@@ -128,8 +128,8 @@ class _Looks:
         if isinstance(error, NotFound | JobExpired) and self._lost.get(path) != stamp:
             self._lost[path] = stamp
         elif isinstance(error, OSError) and error.errno in _NO_ROOM:
-            self._full[path] = shutil.disk_usage(self._target).free
-        elif not self._target.is_dir():
+            self._full[path] = _free(self._target)
+        elif _free(self._target) < 0:
             self._full[path] = -1
         elif isinstance(error, OSError) and _is_shut(path, self._target):
             self._shut.add(path)
@@ -155,8 +155,12 @@ def _stamp(path: Path) -> Stamp | None:
     return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None
 
 
-def _is_full(target: Path, free: int | None) -> bool:
-    return free is not None and (not target.is_dir() or shutil.disk_usage(target).free <= free)
+def _free(target: Path) -> int:
+    """Return how many bytes are free where results go, -1 where no folder is there."""
+    try:
+        return shutil.disk_usage(target).free if target.is_dir() else -1
+    except OSError:  # gone meanwhile, a share that hangs
+        return -1
 
 
 def _is_shut(path: Path, target: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import socket
 import threading
 import time
@@ -273,6 +274,45 @@ def test_a_folder_for_results_that_goes_away_and_comes_back_is_no_failure_of_the
     outcomes = watched(folder, copy)
     assert isinstance(next(outcomes), FileNotFoundError)
     threading.Timer(0.1, (folder / "clean").mkdir).start()  # while it looks, some ten times
+    assert next(outcomes) == "first"
+
+
+def test_a_folder_for_results_that_goes_away_with_a_full_disk_is_waited_for(folder: Path) -> None:
+    asked: list[str] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(source.name)
+        if len(asked) == 1:
+            target.parent.rmdir()
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return copy(source, target)
+
+    outcomes = watched(folder, denoise)
+    assert isinstance(next(outcomes), OSError)
+    threading.Timer(0.1, (folder / "clean").mkdir).start()  # while it looks, some ten times
+    assert next(outcomes) == "first"
+    assert len(asked) == 2
+
+
+def test_a_folder_for_results_may_go_away_while_it_is_looked_at(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage, looks = shutil.disk_usage, iter([FileNotFoundError("gone"), OSError(errno.ESTALE, "stale")])
+
+    def looked_at(path: Path) -> Any:
+        if asked and (error := next(looks, None)):
+            raise error
+        return usage(path)
+
+    asked: list[str] = []
+
+    def denoise(source: Path, target: Path) -> str:
+        asked.append(source.name)
+        if len(asked) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return copy(source, target)
+
+    monkeypatch.setattr(watch.shutil, "disk_usage", looked_at)
+    outcomes = watched(folder, denoise)
+    assert isinstance(next(outcomes), OSError)
     assert next(outcomes) == "first"
 
 
