@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,7 @@ class Pcd(Format):
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the comment that PCL writes, or the first keyword after comments."""
+        head = head.removeprefix(BOM_UTF8)
         if head.startswith(b"# .PCD"):
             return True
         lines = (line.strip() for line in head.split(b"\n"))

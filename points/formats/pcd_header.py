@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,7 +56,7 @@ class PcdHeader:
 def read_header(raw: bytes) -> PcdHeader:
     """Parse the header of a PCD file; raises MalformedFile naming the line."""
     entries: dict[str, list[str]] = {}
-    begin, number = 0, 0
+    begin, number = len(BOM_UTF8) if raw.startswith(BOM_UTF8) else 0, 0
     while "DATA" not in entries:
         end = raw.find(b"\n", begin, MAX_HEADER_BYTES)
         if end < 0:

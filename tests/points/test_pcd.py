@@ -61,6 +61,20 @@ def test_blank_lines_between_points_are_skipped_and_kept(tmp_path: Path) -> None
     assert _written(tmp_path, cloud.with_xyz(xyz)) == raw.replace(b"4 5 6 8", b"4 5 6.5 8")
 
 
+@pytest.mark.parametrize("first", [b"# .PCD v0.7\n", b"# made by hand\n", b""])
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_a_byte_order_mark_is_kept(encoding: str, first: bytes, tmp_path: Path) -> None:
+    plain = _read(tmp_path, pcd(encoding))
+    raw = b"\xef\xbb\xbf" + first + pcd(encoding)[pcd(encoding).index(b"VERSION") :]
+    cloud = _read(tmp_path, raw)
+    np.testing.assert_array_equal(cloud.xyz, plain.xyz)
+    assert _written(tmp_path, cloud) == raw
+    again = _read(tmp_path, _written(tmp_path, cloud.with_xyz(plain.xyz + 1)))
+    assert again.source.raw.startswith(raw[: raw.index(b"DATA")])
+    np.testing.assert_allclose(again.xyz, plain.xyz + 1, rtol=1e-6)
+    assert [*again.attributes] == [*plain.attributes]
+
+
 def test_more_rows_than_points_are_refused(tmp_path: Path) -> None:
     """They would come back as they were, among points that were denoised."""
     with pytest.raises(MalformedFile, match=r"PCD POINTS is 3, and line 18 is one more"):
