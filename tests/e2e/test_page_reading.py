@@ -44,6 +44,12 @@ def test_the_page_reads_a_ply_with_capital_axes(page: Any, scan: Path, tmp_path:
     np.testing.assert_array_equal(np.reshape(read, (-1, 3)), read_cloud(scan)[0].xyz)
 
 
+def test_the_page_reads_a_ply_with_a_byte_order_mark(page: Any, scan: Path) -> None:
+    scan.write_bytes(b"\xef\xbb\xbf" + scan.read_bytes())
+    read = page.evaluate(POSITIONS, [list(scan.read_bytes()), "a.ply"])
+    np.testing.assert_array_equal(np.reshape(read, (-1, 3)), read_cloud(scan)[0].xyz)
+
+
 @pytest.mark.parametrize("separator", [" ", ",", "\t"])
 def test_the_page_refuses_a_first_column_that_counts_the_points_as_the_server_does(page: Any, separator: str) -> None:
     said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031

@@ -17,7 +17,9 @@ export function suffixOf(name) {
 // Return (3 N) positions; a file is what its first bytes say, as on the server.
 export function readPositions(bytes, name) {
   if (bytes[0] === 0x93 && bytes[1] === 0x4e && bytes[2] === 0x55) return readNpy(bytes);
-  if (bytes[0] === 0x70 && bytes[1] === 0x6c && bytes[2] === 0x79 && bytes[3] <= 32) return readPly(bytes);
+  const hasMark = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf; // of byte order
+  const bare = hasMark ? bytes.subarray(3) : bytes;
+  if (bare[0] === 0x70 && bare[1] === 0x6c && bare[2] === 0x79 && bare[3] <= 32) return readPly(bare);
   if (TEXT.includes(suffixOf(name))) return readXyz(bytes, suffixOf(name) === ".tsv" ? ["\t", ...MARKS] : MARKS);
   throw new Error("a format that this page does not read");
 }
