@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -144,11 +144,10 @@ def _members(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
     fitting = {_key(member): member for member in members if _can_be_positions(archive, member)}
-    named = next((key for key in KEYS if key in fitting), None)
-    if named:
-        return fitting[named]
+    if named := _called(fitting):
+        return fitting[named[0]]
     by_name = {_key(member): member for member in members}
-    called = [key for key in KEYS if key in by_name and (not fitting or _has_rows(archive, by_name[key]))]
+    called = [key for key in _called(by_name) if not fitting or _has_rows(archive, by_name[key])]
     if called:
         return by_name[called[0]]  # reading it says what is wrong with it
     if len(fitting) == 1:
@@ -162,6 +161,12 @@ def _choose(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]) -> zipfile
         f"the NPZ archive has {len(fitting)} arrays of shape (N, >= 3), and none named {', '.join(KEYS)}: "
         f"{', '.join(fitting or by_name)[:200]}"
     )
+
+
+def _called(names: Collection[str]) -> list[str]:
+    """Return which of these are names of positions: in the order of KEYS those so written, then those in any case."""
+    known = (name for name in names if name.lower() in KEYS)
+    return sorted(known, key=lambda name: (name not in KEYS, KEYS.index(name.lower())))
 
 
 def _can_be_positions(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bool:

@@ -122,6 +122,15 @@ def test_npz_arrays_that_are_no_positions_are_passed_over(others: dict[str, Any]
     assert written(tmp_path, cloud, "npz") == raw
 
 
+@pytest.mark.parametrize("key", ["Points", "XYZ"])
+def test_names_of_npz_positions_count_in_any_case_but_those_so_written_first(key: str, tmp_path: Path) -> None:
+    others = {"feats": np.ones((6, 3)), "Normals": np.ones((6, 3))}
+    np.testing.assert_array_equal(read(tmp_path, npz(**others, **{key: torus(6)})).xyz, torus(6))
+    np.testing.assert_array_equal(read(tmp_path, npz(**{key: np.ones((6, 3))}, vertices=torus(6))).xyz, torus(6))
+    with pytest.raises(UnsupportedCloud, match=rf"{key}\.npy has shape \(6, 3\) and type <i8"):  # not the features
+        read(tmp_path, npz(**{key: np.ones((6, 3), int)}, feats=torus(6)))
+
+
 def test_an_array_of_another_format_called_as_positions_are_is_an_attribute(tmp_path: Path) -> None:
     cloud = PointCloud(torus(6), {"xyz": np.ones((6, 3)), "coord": np.arange(6)})
     (tmp_path / "body").write_bytes(written(tmp_path, cloud, "npz"))
