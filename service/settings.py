@@ -22,7 +22,7 @@ _SERVICE_LINK = re.compile(r"\w*_(SERVICE_(HOST|PORT\w*)|PORT_\d+_(TCP|UDP|SCTP)
 _SERVICE_URL = re.compile(r"(tcp|udp|sctp)://.+:\d+")
 _ROOT_PATH = re.compile(r"(/[\w.~-]+)*", re.ASCII)
 _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://([a-z0-9._-]+|\[[0-9a-f:.]+\])(:[0-9]+)?", re.ASCII)  # as browsers send it
-_HOST = re.compile(r"[a-z0-9._-]*[a-z0-9_-]|[0-9a-f:.]*:[0-9a-f:.]*", re.ASCII)  # without a dot at its end
+_HOST = re.compile(r"[a-z0-9._-]*[a-z0-9_-]|([0-9a-f.]*:){2}[0-9a-f:.]*", re.ASCII)  # no dot at its end; IPv6
 _POSITIVE = (
     "max_bytes", "max_points", "max_jobs", "max_queued_points", "max_jobs_per_key", "max_spool_bytes",
     "max_sync_seconds", "upload_idle_seconds", "download_idle_seconds", "result_ttl_seconds",

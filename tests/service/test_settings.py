@@ -155,7 +155,15 @@ def test_serve_ends_at_once_with_a_key_that_would_never_match_or_without_its_wei
         ],
         *[
             ("allowed_hosts", each)
-            for each in ("a.example:8000", "https://a.example", "*", "münchen.example", "a.example.")
+            for each in (
+                "a.example:8000",
+                "10.0.0.1:8000",
+                "cafe:80",
+                "https://a.example",
+                "*",
+                "münchen.example",
+                "a.example.",
+            )
         ],
     ],
 )
