@@ -99,8 +99,8 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _target(path: Path) -> Path:
-    """Follow links."""
-    try:
-        return path.resolve()
-    except RuntimeError as exc:  # until Python 3.13
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path)) from exc
+    """Follow links; what they end at need not be there."""
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():  # of a circle one is left
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path))
+    return target
