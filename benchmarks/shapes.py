@@ -14,7 +14,7 @@ from straightpcf.model.run import MIN_POINTS
 from straightpcf.model.train.archive import opened
 from straightpcf.points.errors import InvalidOptions
 
-__all__ = ["ANALYTIC", "NOISE_TYPES", "Shape", "analytic", "make_noise", "punet"]
+__all__ = ["ANALYTIC", "NOISE_TYPES", "Shape", "analytic", "evenly_on", "make_noise", "punet", "turned"]
 
 Floats = npt.NDArray[np.float64]
 Faces = npt.NDArray[np.int64]
@@ -66,9 +66,7 @@ def analytic(resolution: int, names: list[str] | None = None) -> list[Shape]:
     for name in names or ANALYTIC:
         vertices, faces = ANALYTIC[name]()
         rng = np.random.default_rng(list(name.encode()))
-        made.append(
-            Shape(name, _spread(_on_mesh(vertices, faces, 5 * resolution, rng), resolution), vertices, faces, {})
-        )
+        made.append(Shape(name, evenly_on(vertices, faces, resolution, rng), vertices, faces, {}))
     return made
 
 
@@ -91,6 +89,11 @@ NOISE_TYPES: dict[str, Callable[[np.random.Generator, int], Floats]] = {
     "laplace": lambda rng, count: rng.laplace(size=(count, 3)),
     "uniform": _uniform_ball,
 }
+
+
+def evenly_on(vertices: Floats, faces: Faces, count: int, rng: np.random.Generator) -> Floats:
+    """Sample `count` points of a mesh that keep their distance, as a Poisson sampling does: (count, 3)."""
+    return _spread(_on_mesh(vertices, faces, 5 * count, rng), count)
 
 
 def _on_mesh(vertices: Floats, faces: Faces, count: int, rng: np.random.Generator) -> Floats:
@@ -119,7 +122,7 @@ def _grid(rows: int, columns: int, *, round_rows: bool = False, round_columns: b
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def _turned(profile: Floats, around: int = 96) -> Mesh:
+def turned(profile: Floats, around: int = 96) -> Mesh:
     """Turn a profile (M, 2) of radius and height about the z axis."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -134,7 +137,7 @@ def _turned(profile: Floats, around: int = 96) -> Mesh:
 
 def _sphere() -> Mesh:
     angle = np.linspace(0, np.pi, 64)
-    return _turned(np.stack([np.sin(angle), np.cos(angle)], axis=1))
+    return turned(np.stack([np.sin(angle), np.cos(angle)], axis=1))
 
 
 def _torus() -> Mesh:
@@ -157,7 +160,7 @@ def _cylinder() -> Mesh:
     up = np.linspace(-0.8, 0.8, 40)
     out = np.linspace(0, 0.5, 16)[:-1]
     bottom, side, top = (out, np.full(15, -0.8)), (np.full(40, 0.5), up), (out[::-1], np.full(15, 0.8))
-    return _turned(np.concatenate([np.stack(piece, axis=1) for piece in (bottom, side, top)]))
+    return turned(np.concatenate([np.stack(piece, axis=1) for piece in (bottom, side, top)]))
 
 
 def _saddle() -> Mesh:

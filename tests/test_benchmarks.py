@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 
 from benchmarks import scenes
 from benchmarks.command import noise_level
@@ -111,6 +112,15 @@ def test_speed() -> None:
     )
     assert 0 < float(ours[2]) < float(theirs[2])
     assert float(said.split("ratio")[1]) > 1
+
+
+def test_picture(tmp_path: Path) -> None:
+    said = printed("picture", tmp_path / "picture.png", "--points", 2000, "--every", 50, "--threads", 1)
+    body, filtered, room, filtered_room = (float(line.split(": ")[1].split()[0]) for line in said.splitlines())
+    assert filtered < body / 2
+    assert filtered_room < room
+    drawn = imread(tmp_path / "picture.png")[..., :3]
+    assert 0.05 < (drawn.min(axis=2) < 0.9).mean() < 0.9
 
 
 def test_scaling() -> None:
@@ -315,7 +325,7 @@ def test_a_count_of_nothing_is_a_usage_error(refused: Refused, arguments: str) -
 
 @pytest.mark.parametrize(
     "arguments",
-    ["calibrate --state none --out", "calibrate --state none --traces", "scenes --json", "scaling --plot"],
+    ["calibrate --state none --out", "calibrate --state none --traces", "scenes --json", "scaling --plot", "picture"],
 )
 def test_what_cannot_be_written_is_said_before_it_is_made(refused: Refused, arguments: str, tmp_path: Path) -> None:
     code, said = refused(*arguments.split(), tmp_path / "gone" / "figures")
