@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 
@@ -96,3 +99,18 @@ def test_the_wheel_holds_nothing_else(wheel: list[str]) -> None:
 def test_importing_it_does_not_bring_what_is_heavy(module: str, heavy: str) -> None:
     code = f"import sys, {module}; sys.exit({heavy!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("package", ["grpcio", "grpcio-health-checking", "grpcio-reflection", "protobuf"])
+def test_no_older_package_is_let_in_than_the_committed_stubs_take(package: str) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (wanted,) = (each for each in map(Requirement, extras["grpc"]) if each.name == package)
+    stubs, what = ("straightpcf_pb2.py", r"\n    (\d+),\n    (\d+),\n    (\d+),") if package == "protobuf" else (
+        "straightpcf_pb2_grpc.py", r"GRPC_GENERATED_VERSION = '(\d+)\.(\d+)\.(\d+)'"
+    )  # fmt: skip
+    made_by = re.search(what, (ROOT / "points" / "wire" / stubs).read_text())
+    assert made_by is not None
+    major, minor, patch = map(int, made_by.groups())
+    assert wanted.specifier.contains(f"{major}.{minor}.{patch}")
+    older = f"{major}.{minor}.{patch - 1}" if patch else f"{major}.{minor - 1}.99"
+    assert not wanted.specifier.contains(older)

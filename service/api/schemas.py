@@ -36,10 +36,10 @@ def rfc3339(at: datetime) -> str:
     return at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _decimal(text: str) -> str:
-    if not DECIMAL.fullmatch(text):
+def _decimal(value: object) -> object:
+    if isinstance(value, str) and not DECIMAL.fullmatch(value):  # older FastAPI has defaults checked, too: no text
         raise ValueError("it must be a decimal number")
-    return text
+    return value
 
 
 Decimal = BeforeValidator(_decimal)  # of a number in a query: as of the options, 1_0 is none
