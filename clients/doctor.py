@@ -16,7 +16,15 @@ __all__ = ["examine"]
 # As in pyproject.toml, without the extras that an extra takes in.
 EXTRAS = {
     "model": ("torch", "scipy", "fpsample", "safetensors"),
-    "service": ("fastapi", "fastapi-offline", "uvicorn", "pydantic", "python-multipart", "prometheus-client"),
+    "service": (
+        "fastapi",
+        "fastapi-offline",
+        "starlette",
+        "uvicorn",
+        "pydantic",
+        "python-multipart",
+        "prometheus-client",
+    ),
     "grpc": ("grpcio", "grpcio-health-checking", "grpcio-reflection", "grpcio-status", "protobuf"),
     "las": ("lazrs",),
     "open3d": ("open3d",),
