@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from benchmarks.command import errors_in_one_line, file_to_write, positive
-from benchmarks.scenes import SCANNERS, distance_to
+from benchmarks.scenes import SCANNERS, Rod, distance_to
 from benchmarks.shapes import evenly_on, make_noise, turned
 from straightpcf.model.filter import load_filter
 from straightpcf.model.metrics import unit_sphere
+from straightpcf.model.normals import recompute_normals
 
 __all__: list[str] = []
 
@@ -29,7 +29,6 @@ Floats = npt.NDArray[np.float64]
 _NOISE = 0.02  # of the body, in radii
 _WIDE, _HIGH = 640, 480  # pixels of a view
 _FINER = 3  # drawn so many times as large, then made smaller
-_NEAREST = 16
 _LIGHT = np.array([-0.4, 0.5, 0.77])  # from the left, above and the eye
 _DARK, _BRIGHT = np.array([0.10, 0.14, 0.22]), np.array([0.72, 0.84, 0.95])
 
@@ -81,11 +80,8 @@ _ROOM = _Eye(np.array([1.9, -1.2, 2.5]), np.array([-0.1, 3.3, 0.85]), wide=4.4, 
 
 def _lit(seen: Floats) -> Floats:
     """Return how bright points are, 0 to 1, (N,), each by the plane of its nearest."""
-    _, near = cKDTree(seen).query(seen, k=_NEAREST)
-    away = seen[near] - seen[near].mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))[1][:, :, 0]
-    normals *= np.where(normals[:, 2:] < 0, -1, 1)
-    lit: Floats = np.clip(normals @ _LIGHT, 0, 1)
+    towards_the_eye = np.broadcast_to([0.0, 0.0, 1.0], seen.shape)
+    lit: Floats = np.clip(recompute_normals(seen, towards_the_eye) @ _LIGHT, 0, 1)
     return lit
 
 
@@ -107,13 +103,9 @@ def _body(outline: Floats, points: int) -> Floats:
 
 def _from_outline(xyz: Floats, outline: Floats) -> Floats:
     """Return the distances (N,) of points (N, 3) from the surface that an outline (M, 2) makes when turned."""
-    at = np.stack([np.hypot(xyz[:, 0], xyz[:, 1]), xyz[:, 2]], axis=1)
-    nearest = np.full(len(at), np.inf)
-    for start, end in pairwise(outline):
-        axis = end - start
-        along = np.clip((at - start) @ axis / (axis @ axis), 0, 1)
-        np.minimum(nearest, np.linalg.norm(at - start - along[:, None] * axis, axis=1), out=nearest)
-    return nearest
+    beside_axis = np.stack([np.hypot(xyz[:, 0], xyz[:, 1]), np.zeros(len(xyz)), xyz[:, 2]], axis=1)
+    ends = [(float(radius), 0.0, float(height)) for radius, height in outline]
+    return distance_to([Rod("", *some, radius=0.0) for some in pairwise(ends)], beside_axis)
 
 
 @errors_in_one_line()

@@ -29,7 +29,7 @@ from benchmarks.command import errors_in_one_line, file_to_write, noise_level, p
 from straightpcf.model.filter import load_filter
 from straightpcf.points.options import DenoiseOptions
 
-__all__ = ["SCANNERS", "Part", "Scan", "distance_to", "room", "street"]
+__all__ = ["SCANNERS", "Part", "Rod", "Scan", "distance_to", "room", "street"]
 
 Floats = npt.NDArray[np.float64]
 _DISPARITY = 0.00285  # 1 / m: depths that a Kinect tells apart are this times their square apart

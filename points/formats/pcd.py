@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from codecs import BOM_UTF8
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,16 @@ from straightpcf.points.formats.colours import PACKED, packed
 from straightpcf.points.formats.pcd_header import MAX_FIELDS, PcdField, PcdHeader, read_header
 from straightpcf.points.formats.positions import AXES, WRITTEN, changes, moved, put_positions, rounding, widened
 from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
-from straightpcf.points.formats.text import Lines, as_integers, as_numbers, blocks, refuse_binary, replaced, shown
+from straightpcf.points.formats.text import (
+    Lines,
+    as_integers,
+    as_numbers,
+    begin_of_text,
+    blocks,
+    refuse_binary,
+    replaced,
+    shown,
+)
 
 __all__ = ["Pcd"]
 
@@ -56,7 +64,7 @@ class Pcd(Format):
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the comment that PCL writes, or the first keyword after comments."""
-        head = head.removeprefix(BOM_UTF8)
+        head = head[begin_of_text(head) :]
         if head.startswith(b"# .PCD"):
             return True
         lines = (line.strip() for line in head.split(b"\n"))

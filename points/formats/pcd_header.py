@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from codecs import BOM_UTF8
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.positions import axes_among
-from straightpcf.points.formats.text import shown
+from straightpcf.points.formats.text import begin_of_text, shown
 
 __all__ = ["MAX_FIELDS", "PcdField", "PcdHeader", "read_header"]
 
@@ -56,7 +55,7 @@ class PcdHeader:
 def read_header(raw: bytes) -> PcdHeader:
     """Parse the header of a PCD file; raises MalformedFile naming the line."""
     entries: dict[str, list[str]] = {}
-    begin, number = len(BOM_UTF8) if raw.startswith(BOM_UTF8) else 0, 0
+    begin, number = begin_of_text(raw), 0
     while "DATA" not in entries:
         end = raw.find(b"\n", begin, MAX_HEADER_BYTES)
         if end < 0:

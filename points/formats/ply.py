@@ -13,7 +13,7 @@ from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import in_8_bits
-from straightpcf.points.formats.ply_header import BOM, MAX_PROPERTIES, PlyElement, PlyHeader, read_header
+from straightpcf.points.formats.ply_header import MAX_PROPERTIES, PlyElement, PlyHeader, read_header
 from straightpcf.points.formats.ply_rows import AsciiRows, BinaryRows, ascii_rows, binary_rows, scalar_offsets
 from straightpcf.points.formats.positions import (
     AXES,
@@ -27,7 +27,7 @@ from straightpcf.points.formats.positions import (
     widened,
 )
 from straightpcf.points.formats.scalars import check_columns, scalar_columns
-from straightpcf.points.formats.text import blocks, refuse_binary, replaced
+from straightpcf.points.formats.text import begin_of_text, blocks, refuse_binary, replaced
 
 __all__ = ["Ply"]
 
@@ -61,7 +61,7 @@ class Ply(Format):
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the first line."""
-        return head.removeprefix(BOM).startswith((b"ply\n", b"ply\r", b"ply \n", b"ply \r"))
+        return head.startswith((b"ply\n", b"ply\r", b"ply \n", b"ply \r"), begin_of_text(head))
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
         """Read the vertices; scalar properties become attributes."""

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
-from straightpcf.points.formats.text import shown
+from straightpcf.points.formats.text import begin_of_text, shown
 
 __all__ = [
-    "BOM",
     "MAX_HEADER_BYTES",
     "MAX_LINE_BYTES",
     "MAX_PROPERTIES",
@@ -22,7 +21,6 @@ __all__ = [
     "read_header",
 ]
 
-BOM = b"\xef\xbb\xbf"  # that editors put before a text
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 16
 MAX_ELEMENTS = 1024
@@ -79,7 +77,7 @@ class PlyHeader:
 def read_header(raw: bytes) -> PlyHeader:
     """Parse the header of a PLY file; raises MalformedFile naming the line."""
     lines, size = _lines(raw)
-    if lines[0].removeprefix(BOM).strip() != b"ply":
+    if lines[0][begin_of_text(raw) :].strip() != b"ply":
         raise MalformedFile(f"line 1 of a PLY file must be 'ply', not {shown(lines[0])}")
     encoding: str | None = None
     elements: dict[str, tuple[int, dict[str, PlyProperty]]] = {}
@@ -112,7 +110,7 @@ def _lines(raw: bytes) -> tuple[list[bytes], int]:
     """Split off the header, bounded in bytes before anything else looks at it; the last line is `end_header`."""
     begin = 0
     lines: list[bytes] = []
-    magic = len(b"ply") + (len(BOM) if raw.startswith(BOM) else 0)
+    magic = begin_of_text(raw) + len(b"ply")
     # Old Mac: a binary body may begin with the byte of LF.
     only_cr = raw[magic : magic + 1] == b"\r" and raw[magic + 1 : magic + 2] != b"\n"
     while True:

@@ -23,6 +23,7 @@ __all__ = [
     "as_integers",
     "as_number",
     "as_numbers",
+    "begin_of_text",
     "blocks",
     "is_missing",
     "refuse_binary",
@@ -268,6 +269,11 @@ def shown(token: bytes) -> str:
     """Return a token as an error message may show it."""
     text = token[:40].decode("ascii", "backslashreplace")
     return repr(text + "…" if len(token) > 40 else text)
+
+
+def begin_of_text(raw: bytes) -> int:
+    """Return where a text begins: behind the byte order mark that editors put before it."""
+    return len(codecs.BOM_UTF8) if raw.startswith(codecs.BOM_UTF8) else 0
 
 
 def refuse_binary(raw: bytes, begin: int) -> None:

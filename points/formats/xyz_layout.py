@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.colours import RGB
 from straightpcf.points.formats.positions import AXES
-from straightpcf.points.formats.text import as_number, is_missing, shown
+from straightpcf.points.formats.text import as_number, begin_of_text, is_missing, shown
 from straightpcf.points.formats.titles import MAX_COLUMNS, Title, delimiter_of, named_columns, names_axes, words_of
 
 __all__ = ["NO_COMMA", "PTS_COLUMNS", "Layout", "read_layout"]
@@ -22,7 +22,6 @@ _COMMENTS = (b"#", b"//")
 _SEPARATOR = re.compile(rb'"?sep=.?"?', re.IGNORECASE)  # Excel's first line; the rows say it, too
 _REMARKS, _REMARK_BYTES = 20, 1 << 17  # the last comments above a table, of which one may be its title
 NO_COMMA = "decimals have a point here, no comma"
-_BOM = b"\xef\xbb\xbf"
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _DECIMAL_COMMAS = re.compile(rb"[+-]?\d+(?:,\d+)?(?:\s+[+-]?\d+(?:,\d+)?){2,}")  # 0,5 1 2,5: not between commas
 
@@ -46,7 +45,7 @@ class Layout:
 
 def read_layout(raw: bytes, marks: Sequence[bytes]) -> Layout:
     """Read what stands above the table, up to the first line that is neither blank, comment, count nor names."""
-    at, line = len(_BOM) if raw.startswith(_BOM) else 0, 1
+    at, line = begin_of_text(raw), 1
     declared: int | None = None
     names: Title | None = None
     remarks: deque[Title] = deque(maxlen=_REMARKS)
