@@ -98,7 +98,7 @@ def _colour(attributes: _Attributes) -> _Colour | None:
         values = attributes.get(name)
         if values is not None and values.ndim == 1 and values.dtype.kind in "fiu" and values.dtype.itemsize == 4:
             others = {other: values for other, values in attributes.items() if other != name}
-            return None if {*RGB, "alpha"} & {*others} else _of_packed(values, others)
+            return None if {*RGB} & {*others} else _of_packed(values, others)
     return None
 
 
@@ -135,11 +135,16 @@ def _shares(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8] | None:
     return np.rint(shares).astype(np.uint8) if (np.abs(shares - np.rint(shares)) < _SAME).all() else None
 
 
-def _of_packed(values: npt.NDArray[Any], others: dict[str, npt.NDArray[Any]]) -> _Colour:
-    """Take (N,) numbers of 32 bits apart; the fourth byte is an attribute where it is not the same all over."""
+def _of_packed(values: npt.NDArray[Any], others: dict[str, npt.NDArray[Any]]) -> _Colour | None:
+    """Take (N,) numbers of 32 bits apart; the fourth byte is an attribute where it is not the same all over.
+
+    None where another one is called as that would be: MeshLab's alpha, converted, stands beside bytes that say nothing.
+    """
     words = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<"))).view("<u4")
     if values.dtype.kind == "f":
         words = np.where(words == _NO_COLOUR, 0, words)
     alpha, *parts = ((words >> shift & 255).astype(np.uint8) for shift in (24, 16, 8, 0))
-    says_nothing = not alpha.any() or bool((alpha == 255).all())
-    return _Colour(np.stack(parts, axis=1), others if says_nothing else {**others, "alpha": alpha})
+    rgb = np.stack(parts, axis=1)
+    if not alpha.any() or bool((alpha == 255).all()):
+        return _Colour(rgb, others)
+    return None if "alpha" in others else _Colour(rgb, {**others, "alpha": alpha})

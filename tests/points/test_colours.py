@@ -121,6 +121,16 @@ def test_alpha_is_kept_where_it_says_something() -> None:
     assert list(in_8_bits(SAID["PCL's rgba"])) == [*NAMES]
 
 
+@pytest.mark.parametrize("alpha", [np.full(N, 255, np.uint8), np.arange(N, dtype=np.uint8)], ids=["of 255", "of all"])
+def test_a_colour_with_meshlabs_alpha_is_one_again_behind_pcd(alpha: npt.NDArray[np.uint8], tmp_path: Path) -> None:
+    pcd = read_cloud(converted({**SAID["uchar"], "alpha": alpha}, "pcd", tmp_path))[0]
+    for name in ("ply", "las", "csv", "pts"):
+        cloud = read_cloud(converted(dict(pcd.attributes), name, tmp_path))[0]
+        np.testing.assert_array_equal(stacked(cloud), BYTES * np.uint16(257 if name == "las" else 1))
+        if name != "pts":
+            np.testing.assert_array_equal(cloud.attributes["alpha"], alpha)
+
+
 @pytest.mark.parametrize(
     "said",
     [
@@ -131,6 +141,7 @@ def test_alpha_is_kept_where_it_says_something() -> None:
         three(-BYTES.astype(np.int32)),
         {"rgb": WORDS.astype(np.float64)},
         {"rgb": WORDS.view("<f4"), "red": BYTES[:, 0]},
+        {"rgba": WORDS | np.arange(N, dtype="<u4") << 24, "alpha": BYTES[:, 0]},
         {"rgb": BYTES[:, :2]},
         {"colors": np.random.default_rng(0).random((N, 3))},
         {"colors": BYTES - 0.5},
