@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import dataclass
 
@@ -25,12 +26,17 @@ JITTER = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """Hold one failed attempt; retry_after is what the server asked for, in seconds."""
+    """Hold one failed attempt; retry_after is what the server asked for, in seconds, and its error says it, too."""
 
     error: StraightPCFError
     retryable: bool
     retry_after: float | None = None
     cause: Exception | None = None
+
+    def __post_init__(self) -> None:
+        """Tell whoever gets the error, and comes again by itself, when."""
+        if self.retry_after is not None and math.isfinite(self.retry_after):
+            self.error.retry_after = math.ceil(self.retry_after)
 
 
 def next_delay(failure: Failure, *, attempt: int, max_retries: int = MAX_RETRIES) -> float | None:

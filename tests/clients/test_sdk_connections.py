@@ -73,6 +73,12 @@ def test_a_busy_server_is_asked_again_after_the_time_it_names() -> None:
         assert b"authorization: bearer secret" in heads[0].lower()
 
 
+def test_who_is_not_to_be_tried_again_hears_the_time_too() -> None:
+    with answering(BUSY) as (url, _), Client(url, max_retries=0) as client, pytest.raises(ServerBusy) as found:
+        client.health()
+    assert found.value.retry_after == 1  # whole seconds, none too few
+
+
 def test_a_connection_that_breaks_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retry, "FIRST_DELAY_SECONDS", 0.01)
     with answering(b"", HEALTHY) as (url, heads), Client(url) as client:

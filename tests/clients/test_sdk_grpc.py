@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from straightpcf.clients.sdk import AsyncClient, Client
-from straightpcf.points.errors import ServerBusy, TooManyBytes
+from straightpcf.points.errors import RateLimited, ServerBusy, TooManyBytes
 from tests.clouds import noisy, torus
 
 grpc = pytest.importorskip("grpc")
@@ -73,3 +73,23 @@ def test_what_a_proxy_refuses_for_now_is_not_taken_for_what_is_too_large(details
 
     assert len(asked) == 1 + (kind is ServerBusy)
     assert details in str(found.value)
+
+
+def test_the_error_says_when_the_server_wants_to_be_asked_again() -> None:
+    from google.protobuf.any_pb2 import Any as AnyMessage
+    from google.protobuf.duration_pb2 import Duration
+    from google.rpc import code_pb2, error_details_pb2, status_pb2
+    from grpc_status import rpc_status
+
+    status = status_pb2.Status(code=code_pb2.RESOURCE_EXHAUSTED, message="30 a minute")
+    info = error_details_pb2.ErrorInfo(reason="RATE_LIMITED", domain="straightpcf")
+    for detail in (info, error_details_pb2.RetryInfo(retry_delay=Duration(seconds=7))):
+        (packed := AnyMessage()).Pack(detail)
+        status.details.append(packed)
+
+    def refuse(requests: Iterator[bytes], context: Any) -> None:
+        context.abort_with_status(rpc_status.to_status(status))
+
+    with answering(refuse) as url, Client(url, max_retries=0) as client, pytest.raises(RateLimited) as found:
+        client.jobs.create(noisy(torus(400), 0.01))
+    assert found.value.retry_after == 7
