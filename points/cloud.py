@@ -77,6 +77,15 @@ class PointCloud:
         if names := self.normal_names:
             called = dict(zip(names, normals, strict=True))
             return {called.get(name, name): values for name, values in new.items()}
+        return self._apart(new, normals)
+
+    def in_columns(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the attributes as tables and LAS are to have them: an array of normals as nx, ny and nz."""
+        own, names = dict(self.attributes), NORMALS[0]
+        return own if self.normal_names or {*names} & {*own} else self._apart(own, names)
+
+    def _apart(self, new: dict[str, npt.NDArray[Any]], normals: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
+        """Put three columns of these names in the place of an array of normals, if there is one."""
         for name in _NORMAL_ARRAYS:
             if name in new and new[name].shape == (len(self), 3) and new[name].dtype.kind == "f":
                 together = new.pop(name)

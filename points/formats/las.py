@@ -84,7 +84,7 @@ class Las(Format):
         """Name nothing of a file that is only packed or unpacked."""
         if isinstance(cloud.source, LasSource):
             return []
-        attributes = as_dimensions(cloud.attributes)
+        attributes = as_dimensions(cloud.in_columns())
         return [*cloud.beside, *not_held(attributes, self.types, taken=TAKEN), *renamed(cloud)]
 
     def check(self, cloud: PointCloud) -> None:

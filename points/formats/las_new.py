@@ -91,7 +91,7 @@ def _laid_out(
 
     The last by the names that they have now.
     """
-    columns = scalar_columns(in_16_bits(as_dimensions(cloud.attributes)), TYPES, taken=TAKEN)
+    columns = scalar_columns(in_16_bits(as_dimensions(cloud.in_columns())), TYPES, taken=TAKEN)
     has_rgb = all(name in columns and columns[name].dtype == np.uint16 for name in RGB)
     has_time = "gps_time" in columns and _is_double(columns["gps_time"])
     point_format = 2 * has_rgb + has_time

@@ -119,7 +119,7 @@ class Xyz(Format):
 
     def _new_file(self, cloud: PointCloud) -> bytes:
         """Lay out x, y, z and every numeric attribute; their names stand above if there are any."""
-        columns = _axes(cloud) | scalar_columns(unpacked(cloud.attributes), _TYPES, taken=AXES)
+        columns = _axes(cloud) | scalar_columns(unpacked(cloud.in_columns()), _TYPES, taken=AXES)
         separator = " " if self.delimiter is None else self.delimiter.decode()
         names = ("# " if self.delimiter is None else "") + separator.join(columns)
         return _lines([names] if len(columns) > 3 else [], columns, separator)

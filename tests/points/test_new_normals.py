@@ -128,6 +128,19 @@ def test_an_array_of_normals_becomes_columns(tmp_path: Path) -> None:
     assert [*read_cloud(out)[0].attributes] == ["normals_0", "normals_1", "normals_2", "nx"]
 
 
+@pytest.mark.parametrize("table", ["csv", "xyz", "las"])
+def test_an_array_of_normals_are_normals_behind_a_table_too(table: str, tmp_path: Path) -> None:
+    """Else only the numbers would arrive, of columns called normals_0, normals_1 and normals_2."""
+    xyz = XYZ.astype(np.float64)
+    write_cloud(PointCloud(xyz, {"normals": OLD}), out := tmp_path / f"cloud.{table}", format_named(table))
+    back = read_cloud(out)[0]
+    assert back.normal_names == ("nx", "ny", "nz")
+    np.testing.assert_allclose(back.old_normals(), OLD, atol=1e-7)
+    columns = dict(zip(("normal_x", "normal_y", "normal_z"), OLD.T, strict=True))
+    write_cloud(PointCloud(xyz, {"normals": OLD, **columns}), out, format_named(table))
+    assert read_cloud(out)[0].normal_names == tuple(columns)
+
+
 def test_a_cloud_without_normals_takes_none() -> None:
     cloud = PointCloud(XYZ.astype(np.float64), {"nx": OLD[:, 0], "ny": OLD[:, 1]})
     assert cloud.normal_names == ()
