@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -51,6 +52,8 @@ def denoise_file(
     cloud, source_format = read_cloud(job.source, name=job.name or "the cloud", max_points=job.max_points)
     target_format = source_format if job.format is None else format_named(job.format)
     if job.options.normals == "recompute":
+        if target_format is not source_format:  # which finds an array of normals where it was
+            cloud = replace(cloud, attributes=cloud.in_columns())
         _check_normals(cloud, target_format)
     target_format.check(cloud)
     if on_progress is not None:
@@ -156,12 +159,12 @@ class _Preview:
 
 
 def _check_normals(cloud: PointCloud, target: Format) -> None:
-    if not cloud.normal_names:
-        known = ", or ".join(" ".join(names) for names in NORMALS)
-        raise UnsupportedCloud(f"normals=recompute wants a file with normals ({known})")
     if not target.writes_normals:
         able = ", ".join(format.name for format in FORMATS if format.writes_normals)
         raise UnsupportedCloud(f"normals=recompute is for {able}; the result would be {target.name}")
+    if not cloud.normal_names:
+        known = ", or ".join(" ".join(names) for names in NORMALS)
+        raise UnsupportedCloud(f"normals=recompute wants a file with normals ({known})")
 
 
 def _left_behind(cloud: PointCloud, source: Format, target: Format) -> list[str]:

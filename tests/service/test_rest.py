@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from straightpcf.points.errors import ERRORS_BY_CODE
+from straightpcf.points.formats import read_cloud
 from straightpcf.service.api.errors import STATUS_BY_CODE
 from tests.clouds import noisy, sphere, torus
 from tests.conftest import RunningServer
@@ -327,7 +328,7 @@ def test_info_says_what_the_server_takes(strict_server: RunningServer) -> None:
     assert "ply" in {entry["name"] for entry in info["formats"]}
 
 
-def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer) -> None:
+def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer, tmp_path: Path) -> None:
     xyz = noisy(sphere(POINTS), 0.01)
     names = ("x", "y", "z", "nx", "ny", "nz")
     lines = [
@@ -343,3 +344,12 @@ def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer) -> 
     for bad in (f"{query}&format=xyz", f"{server.url}/denoise?normals=flip"):
         assert curl("--data-binary", "@-", bad, stdin=body).problem()["status"] == 422
     assert curl("--data-binary", "@-", query, stdin=npy(xyz)).problem()["code"] == "unsupported_cloud"
+    np.savez(packed := io.BytesIO(), points=xyz, normals=xyz.astype(np.float32))
+    for format, status in {"ply": 200, "pcd": 200, "npz": 422}.items():
+        answer = curl("--data-binary", "@-", f"{query}&format={format}", stdin=packed.getvalue())
+        assert answer.status == status
+        if status == 422:
+            assert answer.problem()["detail"] == "normals=recompute is for ply, pcd; the result would be npz"
+            continue
+        (path := tmp_path / f"a.{format}").write_bytes(answer.body)
+        np.testing.assert_allclose(np.linalg.norm(read_cloud(path)[0].old_normals(), axis=1), 1.0, atol=1e-5)
