@@ -1,4 +1,4 @@
-"""Whether a pass would take noise or shape: noise differs from point to point, shape does not."""
+"""Whether a pass takes noise or shape: noise differs from point to point, shape does not."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from straightpcf.model.neighbourhoods import neighbourhoods
+from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, neighbourhoods
 
-__all__ = ["summed_coherence"]
+__all__ = ["share_of_noise", "summed_coherence"]
 
 Floats = npt.NDArray[np.float64]
 
 _NEIGHBOURS = 16  # whose plane a point moves across, and whose moves its own is compared with, itself among them
+# Up to the first a later pass makes the whole of a scene's step, from the last on nothing of it: how coherent it is
+# about a point, and what the nearest are thick beside how far they spread across their length. The other way round:
+# how wide more of them are beside how long.
+_NOISE, _SHAPE = 0.2, 0.5
+_PLANE_NEIGHBOURS, _PLANE_RATIO, _VOLUME_RATIO = 24, 0.4, 0.7
+_ROD_NEIGHBOURS, _WIDE_RATIO, _ROD_RATIO = 48, 0.6, 0.3
 
 
 def summed_coherence(step: Floats, points: Floats, patch: Floats) -> tuple[float, float]:
@@ -21,11 +27,43 @@ def summed_coherence(step: Floats, points: Floats, patch: Floats) -> tuple[float
     points: (n, 3); patch: (P, 3), these and others around. Of moves along the normals, the products of each point's
     with the mean of its neighbours', and its squares: 0 in all where neighbours move independently, 1 where alike.
     """
-    count = min(_NEIGHBOURS, len(points))
-    if count < 2:
+    if len(points) < 2:
         return 0.0, 0.0
-    normals = neighbourhoods(points, patch, _NEIGHBOURS).normals
-    _, beside = cKDTree(points).query(points, k=count)
-    moves = (step[beside] * normals[:, None]).sum(axis=2)  # (n, k), all along the normal of the first
+    moves = _moves(step, points, neighbourhoods(points, patch, _NEIGHBOURS))
     own, others = moves[:, 0], moves[:, 1:].mean(axis=1)
     return float((own * others).sum()), float(np.square(own).sum())
+
+
+def share_of_noise(step: Floats, points: Floats, patch: Floats) -> Floats:
+    """Return what share of its step (n, 3) each of n points of a scene is to make once a pass has taken the noise.
+
+    points: (n, 3); patch: (P, 3), these and others around. What is left on surfaces is noise, and the network takes it;
+    rods, wires and leaves it draws to their middle, pass after pass, and bends flat, all points alike.
+    """
+    if len(points) < 2:
+        return np.ones(len(points))
+    nearest = Nearest.of(points, patch, _ROD_NEIGHBOURS)
+    moves = _moves(step, points, nearest.first(_NEIGHBOURS))
+    count, squares = moves.shape[1], np.square(moves).mean(axis=1)
+    alike = (
+        count * np.square(moves.mean(axis=1)) / np.maximum(squares, 1e-300)
+    )  # 1 where independent, count where alike
+    least, less, _ = _stds(nearest.first(_PLANE_NEIGHBOURS))
+    _, wide, long = _stds(nearest.first(_ROD_NEIGHBOURS))
+    share: Floats = np.clip((_SHAPE - (alike - 1) / (count - 1)) / (_SHAPE - _NOISE), 0, 1)
+    share *= np.clip((_VOLUME_RATIO - least / less) / (_VOLUME_RATIO - _PLANE_RATIO), 0, 1)
+    share *= np.clip((wide / long - _ROD_RATIO) / (_WIDE_RATIO - _ROD_RATIO), 0, 1)
+    return share
+
+
+def _moves(step: Floats, points: Floats, near: Neighbourhoods) -> Floats:
+    """Return how far each of n points' nearest of them, itself first, move along its normal: (n, k)."""
+    _, beside = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    moves: Floats = (step[beside] * near.normals[:, None]).sum(axis=2)
+    return moves
+
+
+def _stds(near: Neighbourhoods) -> Floats:
+    """Return what is as the stds of n neighbourhoods along their axes, rising: (3, n), all above 0."""
+    stds: Floats = np.sqrt(np.maximum(near.variances, 1e-300)).T
+    return stds

@@ -20,7 +20,8 @@ from straightpcf.model.objects import begin
 from straightpcf.model.on_device import OnDevice
 from straightpcf.model.on_host import OnHost
 from straightpcf.model.processor import First, Processor
-from straightpcf.model.run import MIN_POINTS, DenoiseResult, FinishedPatch, Run
+from straightpcf.model.result import DenoiseResult, FinishedPatch
+from straightpcf.model.run import MIN_POINTS, Run
 from straightpcf.model.turns import turns
 from straightpcf.points.device import DEVICE_NAME
 from straightpcf.points.errors import DeviceUnavailable, InvalidOptions

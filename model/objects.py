@@ -19,7 +19,8 @@ from scipy.sparse.csgraph import connected_components
 from straightpcf.model.calibration import FEWEST_POINTS
 from straightpcf.model.distinct import box_of
 from straightpcf.model.normalize import CloudFrame
-from straightpcf.model.run import DenoiseResult, FinishedPatch, Run
+from straightpcf.model.result import DenoiseResult, FinishedPatch
+from straightpcf.model.run import Run
 from straightpcf.points.options import DenoiseOptions
 
 if TYPE_CHECKING:

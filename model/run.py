@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.model.calibration import FEWEST_POINTS
-from straightpcf.model.coherence import summed_coherence
+from straightpcf.model.coherence import share_of_noise, summed_coherence
 from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
@@ -21,6 +21,7 @@ from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated, without_data
 from straightpcf.model.patches import Patches
 from straightpcf.model.restraint import restrained_step, trusted_noise_stds
+from straightpcf.model.result import DenoiseResult, FinishedPatch
 from straightpcf.model.spread import ROUNDS
 from straightpcf.model.tiles import Tiling, split
 from straightpcf.model.voxels import are_steps, edge_of_voxels, within_voxels
@@ -31,11 +32,12 @@ from straightpcf.points.options import DenoiseOptions
 if TYPE_CHECKING:
     from straightpcf.model.filter import Filter
 
-__all__ = ["MIN_POINTS", "DenoiseResult", "FinishedPatch", "Run"]
+__all__ = ["MIN_POINTS", "Run"]
 
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
-_COHERENCE_PROBES = 8  # patches whose step is looked at
+_COHERENCE_PROBES, _COHERENCE_PROBES_OF_SCENES = 8, 16  # patches whose step is looked at
 _PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
+_PASSES_OF_SCENES = 3  # up to which `auto` asks whether what a scene's next pass takes is noise
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
 _HEARD, _MOVED = 7, 13  # what a pass takes until all patches have been heard, and from there on, in parts of its time
@@ -46,38 +48,17 @@ _NOTHING: _Step = (np.empty(0, dtype=np.int32), np.empty((0, 3)), False)
 
 
 @dataclass(frozen=True)
-class FinishedPatch:
-    """Points whose position in this pass is settled: no other patch of the pass changes them. There may be none.
+class _Shown:
+    """Patches as a pass shows them.
 
-    indices: (n,) int64 rows of the cloud; xyz: (n, 3) float64, the cloud's unit; iteration counts from 1;
-    final: whether this is known to be the last pass, which `auto` finds out only afterwards;
-    progress: 0..1, of the whole job as far as it can be foreseen; it never falls.
+    scales: (M,); known: d, of some of them by number; trusted_noise: the noise that is believed of each of a scene's,
+    (M,), None of an object.
     """
 
-    indices: npt.NDArray[np.int64]
-    xyz: npt.NDArray[np.float64]
-    iteration: int
-    final: bool
-    progress: float
-
-
-@dataclass(frozen=True)
-class DenoiseResult:
-    """The filtered cloud and how it came about.
-
-    xyz: (N, 3) float64 in the order given; noise_before, noise_after: estimated noise std in the cloud's unit;
-    distances: the DistanceModule's median before each pass and after the last; untouched: rows that were not finite,
-    meant "no data", or were so far out or alone that they belong to nothing, and passed through.
-    """
-
-    xyz: npt.NDArray[np.float64]
-    iterations: int
-    noise_before: float
-    noise_after: float
-    distances: tuple[float, ...]
-    untouched: int
-    seconds: float
-    warnings: tuple[str, ...]
+    cut: Patches
+    scales: npt.NDArray[np.float64]
+    known: Mapping[int, float]
+    trusted_noise: npt.NDArray[np.float64] | None
 
 
 class Run:
@@ -251,27 +232,45 @@ class Run:
             shown_walls=self._rounds > ROUNDS,
             thicknesses=[reading.thickness for reading in self.readings],
         )
-        if asked and (coherence := self._coherence(positions)) is not None:
+        if first.scene and first.height_axis is None and self.filter.zoom:
+            left = self._passes_left_of_scene(left, positions)
+        elif asked and (coherence := self._coherence(positions)) is not None:
             left = calibration.passes_by_coherence(left, coherence)
         return max(left, _PASSES_OF_LAYERS - self.iterations) if self.layers else left
+
+    def _passes_left_of_scene(self, left: int, positions: npt.NDArray[np.float64]) -> int:
+        """Return `left`, or one more where that pass's step is noise's; 2 where that is not known yet."""
+        most = _PASSES_OF_SCENES - self.iterations
+        if most <= 0 or left > 1 or (left == 1 and most == 1):
+            return left
+        if left == 1 or self.iterations == 0:
+            return 2
+        coherence = self._coherence(positions)
+        return left if coherence is None else self.filter.calibration.passes_by_coherence(0, coherence)
 
     def _coherence(self, positions: npt.NDArray[np.float64]) -> float | None:
         """Return how coherent the next pass's step would be, by a few patches; None where they do not say."""
         reading = self.readings[-1]
         if reading.probes is None:
             return None
-        some = slice(None, None, max(1, len(reading.probes.seeds) // _COHERENCE_PROBES))
-        cut = reading.probes[some]
-        if not cut.owned.any():  # as of a tiled cloud's probes
-            cut = replace(cut, owned=np.full(len(cut.seeds), round(INNER_SHARE * cut.index.shape[1])))
-        scales = patch_scales(cut.radii, scene=False)
-        known = dict(enumerate(list(reading.known_distances.values())[some]))
+        if reading.scene:
+            shown = self._shown(positions, reading.probes[reading.probes.evenly(_COHERENCE_PROBES_OF_SCENES)], reading)
+        else:
+            some = slice(None, None, max(1, len(reading.probes.seeds) // _COHERENCE_PROBES))
+            known = dict(enumerate(list(reading.known_distances.values())[some]))
+            cut = reading.probes[some]
+            shown = _Shown(cut, patch_scales(cut.radii, scene=False), known, None)
+        if not shown.cut.owned.any():  # as of a tiled cloud's probes
+            inner = np.full(len(shown.cut.seeds), round(INNER_SHARE * shown.cut.index.shape[1]))
+            shown = replace(shown, cut=replace(shown.cut, owned=inner))
 
         def summed(patch: int, displacement: npt.NDArray[np.float64]) -> tuple[float, float]:
-            owned, step, _ = self._restrained_step(positions, cut, scales, reading, None, patch, displacement)
-            return summed_coherence(step, positions[owned], positions.take(cut.index[patch], axis=0))
+            owned, step, _ = self._restrained_step(positions, shown, reading, patch, displacement)
+            return summed_coherence(step, positions[owned], positions.take(shown.cut.index[patch], axis=0))
 
-        found = self.filter.processor.displacements(positions, cut, scales, known, summed, agree=False)
+        found = self.filter.processor.displacements(
+            positions, shown.cut, shown.scales, shown.known, summed, agree=False
+        )
         products, squares = np.sum([sums for sums in found if sums is not None], axis=0)
         return float(products / squares) if squares > 0 else None
 
@@ -298,18 +297,13 @@ class Run:
         steps = [np.zeros_like(positions) for _ in reading.parts[1:]]  # all but the last, which is settled as it comes
         # The patches are cut from `positions`, so results may be written into self.moved as they come.
         for number, cut in self._cuts(positions, tiling, reading.parts):
-            known, trusted_noise = reading.known_distances, None
-            if reading.scene and self.filter.zoom:
-                shown = self.reader.of_scene(positions, cut, raster=reading.height_axis is not None)
-                scales, known = shown.scales, dict(enumerate(shown.distances.tolist()))
-                trusted_noise = trusted_noise_stds(shown.noise_stds, shown.flat, self.readings[0].noise_of_most)
-            else:
-                zoom = self.reader.zooms(positions, cut, reading)
-                scales = patch_scales(cut.radii, scene=reading.scene, zoom=zoom)
-            finish = partial(self._restrained_step, positions, cut, scales, reading, trusted_noise)
+            shown = self._shown(positions, cut, reading)
+            finish = partial(self._step, positions, shown, reading)
             agree = self.filter.agree and len(cut.seeds) > 1
             unheard = iter(cut.owned.tolist())
-            steps_made = self.filter.processor.displacements(positions, cut, scales, known, finish, agree=agree)
+            steps_made = self.filter.processor.displacements(
+                positions, cut, shown.scales, shown.known, finish, agree=agree
+            )
             for made in steps_made:
                 owned, step, held_back = made or _NOTHING
                 self.held_back[owned] |= held_back
@@ -327,28 +321,50 @@ class Run:
                 self._progress = begun_at + (_HEARD * heard + _MOVED * done) / ((_HEARD + _MOVED) * whole) * share
                 yield FinishedPatch(indices, xyz, self.iterations, left == 1, self._progress)
 
+    def _shown(self, positions: npt.NDArray[np.float64], cut: Patches, reading: Reading) -> _Shown:
+        """Say how a pass shows patches."""
+        if not (reading.scene and self.filter.zoom):
+            zoom = self.reader.zooms(positions, cut, reading)
+            return _Shown(cut, patch_scales(cut.radii, scene=reading.scene, zoom=zoom), reading.known_distances, None)
+        shown = self.reader.of_scene(positions, cut, raster=reading.height_axis is not None)
+        trusted_noise = trusted_noise_stds(shown.noise_stds, shown.flat, self.readings[0].noise_of_most)
+        return _Shown(cut, shown.scales, dict(enumerate(shown.distances.tolist())), trusted_noise)
+
+    def _step(
+        self,
+        positions: npt.NDArray[np.float64],
+        shown: _Shown,
+        reading: Reading,
+        patch: int,
+        displacement: npt.NDArray[np.float64],
+    ) -> _Step:
+        """Do what `_restrained_step` does, and leave out what a scene's later passes would take of its shape."""
+        owned, step, held_back = self._restrained_step(positions, shown, reading, patch, displacement)
+        along_known_way = reading.height_axis is not None or self.readings[0].view is not None
+        if self.iterations > 1 and shown.trusted_noise is not None and not along_known_way:
+            step *= share_of_noise(step, positions[owned], positions.take(shown.cut.index[patch], axis=0))[:, None]
+        return owned, step, held_back
+
     def _restrained_step(
         self,
         positions: npt.NDArray[np.float64],
-        cut: Patches,
-        scales: npt.NDArray[np.float64],
+        shown: _Shown,
         reading: Reading,
-        trusted_noise: npt.NDArray[np.float64] | None,
         patch: int,
         displacement: npt.NDArray[np.float64],
     ) -> _Step:
         """Return the points that a patch owns, their step, and whether it was held back; on any thread."""
-        owned, step = cut.owned_points(patch), displacement / scales[patch]
+        owned, step = shown.cut.owned_points(patch), displacement / shown.scales[patch]
         if not self.filter.zoom or not (reading.scene or reading.sampling.restrains):
             return owned, step, False
-        limit = reading.sampling.noise_of_place if trusted_noise is None else trusted_noise[patch]
-        moved, around = self.moved[owned], positions.take(cut.index[patch], axis=0)
+        trusted = reading.sampling.noise_of_place if shown.trusted_noise is None else shown.trusted_noise[patch]
+        moved, around = self.moved[owned], positions.take(shown.cut.index[patch], axis=0)
         step, held_back = restrained_step(
             step,
             moved,
             around,
             sampling=reading.sampling,
-            trusted_noise=limit,
+            trusted_noise=trusted,
             most_on_surfaces=self.readings[0].most_on_surfaces,
             height_axis=reading.height_axis,
             view=self.readings[0].view,

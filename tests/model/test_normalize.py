@@ -34,6 +34,7 @@ def test_a_scenes_patches_are_shown_at_the_usual_size() -> None:
 
 def test_a_room_of_few_points_is_a_scene_by_how_unlike_its_patches_are() -> None:
     assert is_scene(0.054, 0.155, 0.249)  # 66,800 points, as a scanner in the room has them
+    assert is_scene(0.055, 0.142, 0.214)  # 80,000 from the middle of one
     assert not is_scene(0.2, 0.368, 0.55)  # the most unlike of what scanners see of solids
     assert not is_scene(0.0, 0.2, 0.3)
 
