@@ -33,7 +33,7 @@ _FLAT_NOISE = 0.004  # the std that a flat patch's noise is brought to, within l
 # Patches of objects at 50K points have 0.127 and more, those of six real scans 0.07 and less (medians of a cloud).
 _SCENE_RADIUS = 0.1
 # Nine tenths of an object's points have patches up to 2.8 times as large as those of a tenth, also as scanners see it;
-# of a room's, scanned from a place in it, 4.5 times, and few points are of anything but its walls.
+# of a room's, scanned from a place in it, 3.9 times and more, and few points are of anything but its walls.
 _SCENE_SPREAD = 3.3
 # Smaller ones may be those of an object with very many points, where nine tenths of them, taken evenly over the cloud,
 # are not so many times as large as one tenth: 1.03 to 1.72 of dense objects, 1.87 and more of scenes with such patches.
