@@ -18,6 +18,7 @@ _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 
 # Up to this d, which says as much of shape as of noise, a second pass that is not due is made all the same where its
 # step would be less coherent (`model.coherence`) than the first, and one that is due is not from the second on.
 _FAINT_DISTANCE, _NOISE_COHERENCE, _SHAPE_COHERENCE = 0.25, 0.08, 0.15
+_NOISE_COHERENCE_OF_SCENES = 0.12  # below it a scene gets a pass that is not due
 # What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
 # a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
 _STUCK_WITHOUT_WALLS, _STUCK_BY_RADIUS, DENSE_FROM_RADII = 0.7, 8.0, 0.03
@@ -146,6 +147,10 @@ class Calibration:
         if left == 0:
             return 1 if coherence < _NOISE_COHERENCE else 0
         return left if coherence < _SHAPE_COHERENCE else 0
+
+    def passes_of_scene_by_coherence(self, coherence: float) -> int:
+        """Say how many passes of a scene to go, 0 or 1, where `passes_left` says 0, likewise."""
+        return 1 if coherence < _NOISE_COHERENCE_OF_SCENES else 0
 
     def _most_of_few(self, distances: Sequence[float], noise_in_radii: float, points: int, irregular: bool) -> int:
         if points < FEWEST_POINTS:

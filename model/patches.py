@@ -32,12 +32,6 @@ class Patches:
         """Return the rows of the cloud that a patch owns."""
         return self.index[patch, : self.owned[patch]]
 
-    def evenly(self, count: int) -> npt.NDArray[np.int64]:
-        """Return which patches, `count` of them or fewer, have as even a share of the points each."""
-        owned = self.owned if self.owned.any() else np.ones(len(self.owned), dtype=np.int64)
-        count, below = min(count, len(owned)), np.cumsum(owned)
-        return np.unique(np.searchsorted(below, (np.arange(count) + 0.5) / count * below[-1]))
-
     def every(self, step: int) -> Patches:
         """Return each step-th patch."""
         return self[slice(None, None, step)]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["MIN_POINTS", "Run"]
 
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
-_COHERENCE_PROBES, _COHERENCE_PROBES_OF_SCENES = 8, 16  # patches whose step is looked at
+_COHERENCE_PROBES = 8  # patches of an object whose step is looked at
 _PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
 _PASSES_OF_SCENES = 3  # up to which `auto` asks whether what a scene's next pass takes is noise
 _FEWEST_APART = 100  # points among which one may lie apart
@@ -246,7 +246,7 @@ class Run:
         if left == 1 or self.iterations == 0:
             return 2
         coherence = self._coherence(positions)
-        return left if coherence is None else self.filter.calibration.passes_by_coherence(0, coherence)
+        return left if coherence is None else self.filter.calibration.passes_of_scene_by_coherence(coherence)
 
     def _coherence(self, positions: npt.NDArray[np.float64]) -> float | None:
         """Return how coherent the next pass's step would be, by a few patches; None where they do not say."""
@@ -254,7 +254,7 @@ class Run:
         if reading.probes is None:
             return None
         if reading.scene:
-            shown = self._shown(positions, reading.probes[reading.probes.evenly(_COHERENCE_PROBES_OF_SCENES)], reading)
+            shown = self._shown(positions, reading.probes, reading)
         else:
             some = slice(None, None, max(1, len(reading.probes.seeds) // _COHERENCE_PROBES))
             known = dict(enumerate(list(reading.known_distances.values())[some]))

@@ -58,7 +58,7 @@ class View:
         """
         if patches.index.shape[1] < _NEAREST or len(patches.seeds) < _FEWEST:
             return None
-        some = [_Raster.of(_nearest_to(xyz[patches.seeds[n]], xyz[patches.index[n]])) for n in patches.evenly(_PATCHES)]
+        some = [_Raster.of(_nearest_to(xyz[patches.seeds[n]], xyz[patches.index[n]])) for n in _evenly(patches.owned)]
         if _are_regular(some, [raster.broadside() for raster in some]):
             return None  # as they would from anywhere: there is no noise to speak of
         if origin is not None and (seen := cls(origin, 1.0)).fits(some):
@@ -264,6 +264,13 @@ def _irregularity(distances: torch.Tensor, across_places: torch.Tensor, nearest:
 def _nearest_to(seed: Floats, points: Floats) -> Floats:
     order = np.argsort(np.square(points - seed).sum(axis=1), kind="stable")
     return points[order[:_NEAREST]]
+
+
+def _evenly(owned: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return which patches are looked at, (n,), of such as own (M,) points: as even a share of the points has each."""
+    count = min(_PATCHES, len(owned))
+    below = np.cumsum(owned if owned.any() else np.ones(len(owned), dtype=np.int64))
+    return np.unique(np.searchsorted(below, (np.arange(count) + 0.5) / count * below[-1]))
 
 
 def _half_sphere(count: int) -> torch.Tensor:

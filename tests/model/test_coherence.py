@@ -59,6 +59,7 @@ def test_a_later_pass_of_a_scene_takes_noise_of_surfaces_and_nothing_of_shapes_r
 def test_a_second_pass_is_made_where_its_step_is_noise_and_none_where_it_is_shape() -> None:
     made = {c: [Calibration().passes_by_coherence(left, c) for left in (0, 2)] for c in (0.02, 0.1, 0.2)}
     assert made == {0.02: [1, 2], 0.1: [0, 2], 0.2: [0, 0]}
+    assert [Calibration().passes_of_scene_by_coherence(c) for c in (0.02, 0.1, 0.2)] == [1, 1, 0]
 
 
 def test_only_after_the_first_pass_of_little_noise_the_next_step_is_looked_at() -> None:
