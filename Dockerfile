@@ -12,7 +12,7 @@ RUN apt-get update \
 RUN case "$TORCH" in cpu|cuda) ;; *) echo "TORCH is $TORCH; it must be cpu or cuda" >&2; exit 1 ;; esac \
     && python -m venv /venv \
     && if [ "$TORCH" = cpu ]; then \
-        /venv/bin/pip install --no-cache-dir "torch>=2.6,<2.14" --index-url https://download.pytorch.org/whl/cpu; \
+        /venv/bin/pip install --no-cache-dir "torch>=2.6,<3" --index-url https://download.pytorch.org/whl/cpu; \
     fi
 WORKDIR /source
 COPY pyproject.toml README.md ./

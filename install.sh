@@ -29,10 +29,11 @@ if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
 fi
 [ -x .venv/bin/pip ] || "$python" -m venv .venv # without pip it was left by a run that failed
 if [ "$torch" = cpu ] && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
-  # The public index serves CUDA builds of torch; PyTorch's own serves the CPU build. Where that one cannot be
-  # reached, the index in use decides.
-  .venv/bin/pip install -q --retries 0 --timeout 10 'torch>=2.6,<2.14' \
-    --index-url https://download.pytorch.org/whl/cpu 2>/dev/null || true
+  # The public index serves CUDA builds of torch, PyTorch's own the CPU build; where that one cannot be reached, another
+  # index in use may have such a build, older than its newest. Where none has, that index decides.
+  pytorch=(--retries 0 --timeout 10 --index-url https://download.pytorch.org/whl/cpu)
+  build=$(.venv/bin/pip index versions torch "${pytorch[@]}" 2>/dev/null | grep -o '[0-9.]*+cpu' | head -n 1 || true)
+  .venv/bin/pip install -q "torch>=2.6,<3${build:+,==$build}" "${pytorch[@]}" 2>/dev/null || true
 fi
 .venv/bin/pip install -q -e '.[dev]'
 # pip compiles what it copies, not what it links to; where PYTHONDONTWRITEBYTECODE is set nothing else would.

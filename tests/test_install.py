@@ -72,6 +72,18 @@ def test_a_torch_that_there_is_not_is_refused_before_anything_is_done(folder: Pa
     assert not (folder / ".venv").exists()
 
 
+@pytest.mark.parametrize(("offered", "wanted"), [("2.14.1, 2.13.0+cpu", ",==2.13.0+cpu"), ("2.14.1", "")])
+def test_a_cpu_build_of_torch_is_taken_where_an_index_has_one(folder: Path, offered: str, wanted: str) -> None:
+    assert install(folder).returncode == 0
+    pip = f'[ "$1" = index ] && echo "Available versions: {offered}" || echo "$@" >> {folder}/asked'
+    for name, does in {"pip": pip, "python": '[ "$2" != "import torch" ]'}.items():
+        (folder / ".venv" / "bin" / name).write_text(f"#!/bin/bash\n{does}\n")
+    assert install(folder, STRAIGHTPCF_TORCH="cpu").returncode == 0
+    of_torch, of_all = (folder / "asked").read_text().splitlines()
+    assert of_torch.startswith(f"install -q torch>=2.6,<3{wanted} ")
+    assert of_all == "install -q -e .[dev]"
+
+
 def test_a_torch_without_cuda_that_was_there_before_is_named_where_cuda_is_wanted(folder: Path) -> None:
     assert install(folder, STRAIGHTPCF_TORCH="cuda").stderr == ""
     python = folder / ".venv" / "bin" / "python"
