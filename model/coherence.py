@@ -13,9 +13,9 @@ __all__ = ["share_of_noise", "summed_coherence"]
 Floats = npt.NDArray[np.float64]
 
 _NEIGHBOURS = 16  # whose plane a point moves across, and whose moves its own is compared with, itself among them
-# Up to the first a later pass makes the whole of a scene's step, from the last on nothing of it: how coherent it is
-# about a point, and what the nearest are thick beside how far they spread across their length. The other way round:
-# how wide more of them are beside how long.
+# A later pass of a scene makes the whole step of a point up to the first, nothing of it from the second on: how
+# coherent it is among these; how thick so many nearest are, beside their width; how wide more of them are, beside their
+# length (from the first on, and up to the second).
 _NOISE, _SHAPE = 0.2, 0.5
 _PLANE_NEIGHBOURS, _PLANE_RATIO, _VOLUME_RATIO = 24, 0.4, 0.7
 _ROD_NEIGHBOURS, _WIDE_RATIO, _ROD_RATIO = 48, 0.6, 0.3
@@ -45,9 +45,8 @@ def share_of_noise(step: Floats, points: Floats, patch: Floats) -> Floats:
     nearest = Nearest.of(points, patch, _ROD_NEIGHBOURS)
     moves = _moves(step, points, nearest.first(_NEIGHBOURS))
     count, squares = moves.shape[1], np.square(moves).mean(axis=1)
-    alike = (
-        count * np.square(moves.mean(axis=1)) / np.maximum(squares, 1e-300)
-    )  # 1 where independent, count where alike
+    # 1 where neighbours move independently, as many as they are where alike.
+    alike = count * np.square(moves.mean(axis=1)) / np.maximum(squares, 1e-300)
     least, less, _ = _stds(nearest.first(_PLANE_NEIGHBOURS))
     _, wide, long = _stds(nearest.first(_ROD_NEIGHBOURS))
     share: Floats = np.clip((_SHAPE - (alike - 1) / (count - 1)) / (_SHAPE - _NOISE), 0, 1)

@@ -37,6 +37,7 @@ __all__ = ["MIN_POINTS", "Run"]
 MIN_POINTS = 33  # a point and the 32 neighbours of its graph: the smallest patch
 _COHERENCE_PROBES = 8  # patches of an object whose step is looked at
 _PASSES_OF_LAYERS = 3  # `auto` makes of points in layers at least
+_LITTLE_LEFT = 0.25  # d before a later pass of a scene, below which what lies in no surface takes no part in it
 _PASSES_OF_SCENES = 3  # up to which `auto` asks whether what a scene's next pass takes is noise
 _FEWEST_APART = 100  # points among which one may lie apart
 _SPREAD_LIMIT = 0.5  # of the noise at the start, the farthest that a point goes along the surface between two passes
@@ -341,7 +342,8 @@ class Run:
         """Do what `_restrained_step` does, and leave out what a scene's later passes would take of its shape."""
         owned, step, held_back = self._restrained_step(positions, shown, reading, patch, displacement)
         along_known_way = reading.height_axis is not None or self.readings[0].view is not None
-        if self.iterations > 1 and shown.trusted_noise is not None and not along_known_way:
+        later = self.iterations > 1 and reading.distance < _LITTLE_LEFT
+        if later and shown.trusted_noise is not None and not along_known_way:
             step *= share_of_noise(step, positions[owned], positions.take(shown.cut.index[patch], axis=0))[:, None]
         return owned, step, held_back
 

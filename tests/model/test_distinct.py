@@ -142,4 +142,4 @@ def test_near_copies_take_no_noise_away_from_the_filter(shipped: Filter) -> None
         assert result.noise_before == pytest.approx(alone.noise_before, rel=0.05)
         moved = (result.xyz - copies)[np.argsort(rows, kind="stable")].reshape(-1, 3, 3)
         # Row i is still row i. A border of both grids may part copies, whose float32 coordinates differ in a last bit.
-        np.testing.assert_allclose(moved, moved[:, :1].repeat(3, axis=1), rtol=1e-4, atol=1e-15)
+        np.testing.assert_allclose(moved, moved[:, :1].repeat(3, axis=1), rtol=3e-4, atol=1e-15)
