@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,8 @@ from scipy.spatial import cKDTree
 __all__ = ["Distinct", "box_of", "cell_of", "half_reach"]
 
 Floats = npt.NDArray[np.float64]
+
+_Rounding = Callable[..., Floats]  # of cells to whole numbers, `out` like a ufunc's
 
 # How large a cell is beside a cloud, as a power of two: 2^-20 is about 1e-6. No scanner resolves that; a copy that went
 # through float32 is off by 3e-8 at most, so that a border parts few pairs; and of a million points drawn at random on a
@@ -36,8 +39,8 @@ class Distinct:
 
     xyz: (U, 3) float64, the position of one point of each; inverse: (N,) the place of each point. Where no two points
     share one, both keep the order. cell: points that lie in one cell of that edge, in the cloud's unit, are in one
-    place, and so are copies (`_copies`); 0 leaves equal points. There are two grids, half a cell apart; pairs that a
-    border of each parts stay two.
+    place, and so are copies (`_copies`); 0 leaves equal points. There are two grids, half a cell apart, and where these
+    find any a third between them; pairs that a border of each parts stay two.
     """
 
     def __init__(self, xyz: Floats, *, cell: float = 0.0) -> None:
@@ -45,6 +48,8 @@ class Distinct:
         # One grid after the other, of what the first has left: links through both could chain a whole dense part.
         for rounding in (np.floor, np.rint) if cell else (None,):
             self._join(_grouped(self.xyz, cell, rounding))
+        if cell and self.repeated:
+            self._join(_grouped(self.xyz, cell, _floor_between))
         if cell:
             self._join(_copies((self.xyz / 2 - self.xyz[0] / 2) / cell))  # halves: else both might overflow
         if not self.repeated:
@@ -98,7 +103,7 @@ def half_reach(xyz: Floats) -> tuple[Floats, float]:
 
 
 def _grouped(
-    xyz: Floats, cell: float, rounding: np.ufunc | None
+    xyz: Floats, cell: float, rounding: _Rounding | None
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
     """Return the first row of each group of rows in one cell, and each row's group; None where no two are in one.
 
@@ -149,7 +154,13 @@ def _are_copied(xyz: Floats) -> bool:
     return bool(np.mean(shares) >= _COPIED_SHARE)
 
 
-def _hashed(xyz: Floats, cell: float, rounding: np.ufunc | None) -> npt.NDArray[np.uint64]:
+def _floor_between(cells: Floats, *, out: Floats) -> Floats:
+    """Round to the grid of which no border is within a quarter of a cell of one of the other two."""
+    cells += 0.25
+    return np.floor(cells, out=out)
+
+
+def _hashed(xyz: Floats, cell: float, rounding: _Rounding | None) -> npt.NDArray[np.uint64]:
     hashed = np.zeros(len(xyz), dtype=np.uint64)
     for axis in range(3):
         bits = _column(xyz, axis, cell, rounding).view(np.uint64)
@@ -159,7 +170,7 @@ def _hashed(xyz: Floats, cell: float, rounding: np.ufunc | None) -> npt.NDArray[
     return hashed
 
 
-def _column(xyz: Floats, axis: int, cell: float, rounding: np.ufunc | None) -> Floats:
+def _column(xyz: Floats, axis: int, cell: float, rounding: _Rounding | None) -> Floats:
     """Return a coordinate of each row's cell, or of the row itself; a new array."""
     if rounding is None:
         return xyz[:, axis] + 0.0  # -0.0 + 0.0 is 0.0
