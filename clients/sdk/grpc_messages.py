@@ -124,10 +124,7 @@ class Answer:
                 kind, seq, data = event_of(message)
                 receiver.write(_Event(kind, str(seq), json.dumps(data)))
             case pb.Patch():
-                if self._points is None:
-                    self._points = message.points
-                    receiver.begin(200, {})
-                    receiver.write(encode_header(message.points))
+                self._begin_patches(message.points)
                 frame = frame_of(message)
                 receiver.write(
                     encode_frame(
@@ -148,11 +145,18 @@ class Answer:
 
     def finish(self) -> Failure | None:
         """Take the end of a call that went well."""
-        if self._points is not None:
+        if self._call.rpc == "StreamPatches":
+            self._begin_patches(0)  # nothing came of a cloud that was not filtered: all of it lies in one place
             self._receiver.write(encode_end(1))
         elif self._call.rpc == "WatchJob" and self._is_empty:
             self._receiver.begin(204, {})  # as REST says that nothing is left to tell
         return self._receiver.finish()
+
+    def _begin_patches(self, points: int) -> None:
+        if self._points is None:
+            self._points = points
+            self._receiver.begin(200, {})
+            self._receiver.write(encode_header(points))
 
     def _begin_file(self, result: pb.ResultInfo) -> None:
         asked = self._receiver.headers().get("Range")

@@ -8,11 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 
 from straightpcf.clients.sdk import AsyncClient, Client
 from straightpcf.points.errors import RateLimited, ServerBusy, TooManyBytes
 from tests.clouds import noisy, torus
+from tests.conftest import RunningServer
 
 grpc = pytest.importorskip("grpc")
 
@@ -93,3 +95,15 @@ def test_the_error_says_when_the_server_wants_to_be_asked_again() -> None:
     with answering(refuse) as url, Client(url, max_retries=0) as client, pytest.raises(RateLimited) as found:
         client.jobs.create(noisy(torus(400), 0.01))
     assert found.value.retry_after == 7
+
+
+def test_a_cloud_that_is_not_filtered_has_no_patches_and_they_do_not_break_off(server: RunningServer) -> None:
+    async def there(id: str) -> list[object]:
+        async with AsyncClient(server.grpc_url, max_retries=0) as client:
+            return [frame async for frame in (await client.jobs.get(id)).patches()]
+
+    with Client(server.grpc_url, max_retries=0) as client:
+        job = client.jobs.create(np.ones((100, 3)))  # all in one place
+        assert list(job.patches()) == asyncio.run(there(job.id)) == []
+        assert job.refresh().state == "succeeded"
+        job.delete()
