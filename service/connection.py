@@ -76,7 +76,7 @@ class _Connection(H11Protocol):
     def data_received(self, data: bytes) -> None:
         if self._lingers:
             self._unset_keepalive_if_required()
-        else:
+        elif self.conn.their_state is not h11.MUST_CLOSE:  # behind its last request nothing counts (RFC 9112, 9.6)
             super().data_received(data)
         self._be_patient()
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.service.engines import submit, until
-from tests.service.fakes import Large, ObedientBackend
+from tests.service.fakes import CONTENT, Large, ObedientBackend
 from tests.service.in_process import serving
 from tests.service.test_races import CLOUD, POST, play, willing
 
@@ -247,6 +247,29 @@ def test_one_whose_peer_closes_half_of_it_is_taken_for_gone_and_frees_the_worker
             assert await asyncio.wait_for(reader.read(), timeout=10) == b""
             while (await engine.list())[0]:
                 await asyncio.sleep(0.01)
+            writer.close()
+
+    play(scenario)
+
+
+@pytest.mark.parametrize("behind", [b"\r\n", GOOD, b"no HTTP"])
+@pytest.mark.parametrize("last", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nConnection: close\r\n"])
+def test_what_comes_behind_the_last_request_of_one_takes_its_answer_from_nobody(
+    tmp_path: Path, last: bytes, behind: bytes
+) -> None:
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend) as (_, host, port):
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(POST.replace(b"HTTP/1.1\r\n", last))
+            await until(lambda: backend.runs)
+            writer.write(behind)
+            await asyncio.sleep(0.1)
+            backend.finish.set()
+            answer = await asyncio.wait_for(reader.read(), timeout=10)
+            assert answer.startswith(b"HTTP/1.1 200 ")
+            assert answer.endswith(b"\r\n\r\n" + CONTENT)
             writer.close()
 
     play(scenario)
