@@ -25,6 +25,7 @@ __all__ = ["connection_class", "tell_briefly"]
 
 _TWO_LENGTHS = frozenset({b"content-length", b"transfer-encoding"})
 _CLOSE = (b"connection", b"close")
+_AHEAD_BYTES = 2**16  # of further requests, held while one is answered; where it is more, TCP holds the rest
 _LONGEST_USER_TIMEOUT = 2**31 - 1  # ms, what Linux takes
 _TOLD_AGAIN_SECONDS = 10.0
 
@@ -78,6 +79,7 @@ class _Connection(H11Protocol):
             self._unset_keepalive_if_required()
         elif self.conn.their_state is not h11.MUST_CLOSE:  # behind its last request nothing counts (RFC 9112, 9.6)
             super().data_received(data)
+            self._look_on()
         self._be_patient()
 
     def handle_events(self) -> None:
@@ -123,6 +125,14 @@ class _Connection(H11Protocol):
 
         Java's client asks for it with every request, and the warning says to install WebSockets.
         """
+
+    def _look_on(self) -> None:
+        """Read on where further requests wait for an answer to the first: else its client is not seen to go.
+
+        uvicorn reads no more then, and what the client asked for would be worked on to its end, for nobody.
+        """
+        if self.conn.their_state is h11.DONE and len(self.conn.trailing_data[0]) <= _AHEAD_BYTES:
+            self.flow.resume_reading()
 
     def _be_patient(self) -> None:
         is_answering = self.cycle is not None and not self.cycle.response_complete

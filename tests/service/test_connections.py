@@ -275,6 +275,26 @@ def test_what_comes_behind_the_last_request_of_one_takes_its_answer_from_nobody(
     play(scenario)
 
 
+@pytest.mark.parametrize("behind", [b"\r\n", GOOD])
+def test_one_that_is_closed_behind_a_further_request_frees_the_worker(tmp_path: Path, behind: bytes) -> None:
+    async def scenario() -> None:
+        backend = willing()
+        backend.finish.clear()
+        async with serving(tmp_path, backend) as (engine, host, port):
+            _, writer = await asyncio.open_connection(host, port)
+            writer.write(POST)
+            await until(lambda: backend.runs)
+            for _ in range(3):
+                writer.write(behind)
+                await asyncio.sleep(0.05)
+            writer.close()
+            while (await engine.list())[0]:
+                await asyncio.sleep(0.01)
+            assert len(backend.canceled) == 1
+
+    play(scenario)
+
+
 async def _send_now_and_then(writer: asyncio.StreamWriter, *, seconds: float) -> None:
     while True:
         await asyncio.sleep(seconds)
