@@ -10,7 +10,9 @@ from typing import Any
 import httpx2
 import pytest
 
+from straightpcf.points.errors import TooFewPoints
 from straightpcf.service.engine import Engine
+from straightpcf.service.jobs.store import JobStore
 from tests.service.engines import until
 from tests.service.fakes import ObedientBackend
 from tests.service.in_process import serving
@@ -159,6 +161,25 @@ def test_a_fault_of_the_server_is_documented_too(tmp_path: Path, path: str) -> N
             reader = Reader(http)
             await reader.read()
             await reader.ask("GET", path, "", {}, None, 500)
+
+    play(scenario)
+
+
+def test_an_expired_job_still_tells_what_became_of_it(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        backend = willing(ObedientBackend(TooFewPoints("5 points")))  # of the first job
+        async with (
+            serving(tmp_path, backend, result_ttl_seconds=0.01) as (engine, host, port),
+            _client(host, port) as http,
+        ):
+            for id in ("failed", "succeeded"):
+                await http.put(f"/jobs/{id}?filename=a.xyz", content=CLOUD)
+                before = (await http.get(f"/jobs/{id}?wait=9")).json()
+                assert before["state"] == id
+                await asyncio.sleep(0.05)
+                await engine._call(JobStore.expire)
+                assert (await http.get(f"/jobs/{id}")).json() == before | {"state": "expired"}
+                assert (await http.get(f"/jobs/{id}/report")).status_code == (422 if id == "failed" else 410)
 
     play(scenario)
 
