@@ -68,9 +68,10 @@ class AsyncHttpTransport(AsyncTransport):
         self._http = _made(httpx2.AsyncClient, url, api_key, timeout)
 
     async def close(self) -> None:
-        """Close the connections."""
+        """Close the connections; those of an event loop that is over went with it."""
         self.closed = True
-        await self._http.aclose()
+        if self._loop is None or not self._loop.is_closed():
+            await self._http.aclose()
 
     async def attempt(self, call: Call, receiver: Receiver, attempts: Attempts) -> AsyncGenerator[None]:
         """Make one request."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterator
@@ -80,6 +81,35 @@ def test_a_client_in_another_event_loop_says_so() -> None:
                 asyncio.run(client.health())
             with pytest.raises(InvalidRequest, match="belongs to another event loop"):
                 asyncio.run(client.health())
+
+
+# The loop ended with a connection open, which Python says by itself.
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+def test_a_client_whose_event_loop_is_over_is_closed_in_another() -> None:
+    async def use(client: AsyncClient) -> None:
+        async with client:
+            await client.health()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            with connection:  # which stays open behind the answer
+                connection.recv(1 << 16)
+                connection.sendall(HEALTHY.replace(b"Connection: close\r\n", b""))
+                over.wait(10)
+
+        over = threading.Event()
+        (answering := threading.Thread(target=answer)).start()
+        client = AsyncClient(f"http://127.0.0.1:{server.getsockname()[1]}", max_retries=0)
+        asyncio.run(client.health())
+        with pytest.raises(InvalidRequest, match="belongs to another event loop"):
+            asyncio.run(use(client))
+        asyncio.run(client.aclose())
+        over.set()
+        answering.join()
+        del client
+        gc.collect()
 
 
 def test_an_upload_that_is_cancelled_while_its_file_is_read_is_cancelled(
