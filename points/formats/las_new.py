@@ -152,6 +152,8 @@ def _fits(values: npt.NDArray[Any], dimension: LasDimension) -> bool:
     limits = np.iinfo(dimension.dtype)
     low, high = limits.min, limits.max if dimension.bits is None else (1 << dimension.bits) - 1
     with np.errstate(invalid="ignore"):  # a signalling NaN is no warning
+        if values.dtype.kind == "f" and values.dtype.itemsize == 2:
+            values = values.astype(np.float32)  # to a half 65535 is infinity
         return bool(((values >= low) & (values <= high) & (values == np.rint(values))).all())
 
 

@@ -143,6 +143,14 @@ def test_columns_of_text_faces_and_records_are_named(tmp_path: Path) -> None:
     assert format_named("npy").left_behind(colours) == ["red", "intensity"]
 
 
+@pytest.mark.parametrize("kind", ["<f2", ">f2"])
+def test_halves_become_a_dimension_of_las_where_they_fit(kind: str, tmp_path: Path) -> None:
+    whole, beyond = np.arange(40).astype(kind), np.full(40, np.inf, kind)
+    again = converted(PointCloud(torus(40), {"Intensity": whole, "User Data": beyond}), "las", tmp_path)
+    np.testing.assert_array_equal(again.attributes["intensity"], whole)
+    np.testing.assert_array_equal(again.attributes["User_Data"], beyond)
+
+
 MANY = {f"column_{column}": np.zeros(9) for column in range(400)}
 NOT_FINITE = np.where(np.arange(27) == 5, np.nan, torus(9).ravel()).reshape(9, 3)
 CLOUDS = {
