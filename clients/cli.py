@@ -32,7 +32,7 @@ from straightpcf.clients.console import (
     show_noise,
 )
 from straightpcf.clients.job_commands import Format, Iterations, Key, Name, Normals, Seed, Strength
-from straightpcf.clients.stdio import STDIO, input_file, input_name, output_file
+from straightpcf.clients.stdio import STDIO, given_path, input_file, input_name, output_file
 from straightpcf.points import errors
 from straightpcf.points.device import DEVICE_NAME
 
@@ -111,8 +111,10 @@ def options(
 
 @app.command()
 def denoise(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="The noisy cloud; - for stdin.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where it goes; its suffix says how; - for stdout.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", parser=given_path, help="The noisy cloud; - for stdin.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="OUT", parser=given_path, help="Where it goes; its suffix says how; - for stdout.")
+    ],
     iterations: Iterations = "auto",
     device: Device = "auto",
     seed: Seed = "0",
@@ -242,7 +244,7 @@ def serve(
 
 @app.command()
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The cloud; - for stdin.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", parser=given_path, help="The cloud; - for stdin.")],
     name: Name = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

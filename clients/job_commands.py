@@ -21,7 +21,7 @@ from straightpcf.clients.console import (
     show_noise,
     to_stdout,
 )
-from straightpcf.clients.stdio import STDIO, content_of, input_name, is_stream, stdout
+from straightpcf.clients.stdio import STDIO, content_of, given_path, input_name, is_stream, stdout
 from straightpcf.points.errors import InvalidOptions
 
 if TYPE_CHECKING:
@@ -59,7 +59,9 @@ def connect(url: str, api_key: str | None) -> Iterator[Client]:
 
 
 def submit(
-    sources: Annotated[list[Path], typer.Argument(metavar="FILE", help="The noisy clouds; - for stdin.")],
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILE", parser=given_path, help="The noisy clouds; - for stdin.")
+    ],
     iterations: Iterations = "auto",
     seed: Seed = "0",
     strength: Strength = "1.0",
@@ -146,7 +148,7 @@ def jobs(
 
 def result(
     id: Id,
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="Where to write it; - for stdout.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", parser=given_path, help="Where to write it; - for stdout.")],
     url: Url = DEFAULT_URL,
     api_key: Key = None,
     as_json: AsJson = False,

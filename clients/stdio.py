@@ -14,9 +14,15 @@ from straightpcf.clients.atomic import place_named
 from straightpcf.clients.console import to_stdout
 from straightpcf.points.errors import InvalidRequest
 
-__all__ = ["STDIO", "content_of", "input_file", "input_name", "is_stream", "output_file", "stdout"]
+__all__ = ["STDIO", "content_of", "given_path", "input_file", "input_name", "is_stream", "output_file", "stdout"]
 
 STDIO = Path("-")
+
+
+def given_path(text: str) -> Path:
+    """Return an argument as a path: ./- is a file, and its Path would be that of - alone."""
+    found = Path(text)
+    return found.absolute() if found == STDIO and text != "-" else found
 
 
 def stdout() -> BinaryIO:

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from straightpcf.clients.cli import app
-from straightpcf.clients.stdio import STDIO, content_of, input_file, input_name, is_stream
+from straightpcf.clients.stdio import STDIO, content_of, given_path, input_file, input_name, is_stream
 from straightpcf.points.errors import UnknownFormat
 from tests.clouds import torus
 
@@ -51,6 +51,17 @@ def test_info_reads_pipes_and_stdin(tmp_path: Path) -> None:
         assert (facts["format"], facts["points"]) == ("npy", 50), done.stderr
     named = CliRunner().invoke(app, ["info", "-", "--name", "a.xyz", "--json"], input=TABLE)
     assert json.loads(named.stdout)["points"] == 100_000
+
+
+def test_a_file_that_is_called_a_dash_is_read_and_written_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save(tmp_path / "cloud.npy", torus(50))
+    (tmp_path / "cloud.npy").rename(tmp_path / "-")
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["info", "./-", "--json"], input=TABLE)
+    assert json.loads(done.stdout)["points"] == 50, done.stderr
+    assert [given_path(text) for text in ("-", "./-", "./a.ply")] == [STDIO, tmp_path / "-", Path("a.ply")]
 
 
 def test_the_number_of_a_pipe_is_no_name(tmp_path: Path) -> None:
