@@ -263,7 +263,7 @@ def _float(name: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     with np.errstate(over="ignore", invalid="ignore"):
         stored = values.astype("<f4")
         again = stored.astype(values.dtype)
-    if name in NORMALS[1]:
+    if name in NORMALS[1] and values.dtype.kind == "f":  # whole numbers are no normal
         return stored if np.array_equal(np.isfinite(stored), np.isfinite(values)) else values
     others = moved(again, values)
     # Of a text, 0.4 is the float32 that is written so.

@@ -151,6 +151,13 @@ def test_halves_become_a_dimension_of_las_where_they_fit(kind: str, tmp_path: Pa
     np.testing.assert_array_equal(again.attributes["User_Data"], beyond)
 
 
+def test_whole_numbers_that_are_called_as_a_normal_stay_as_they_are_in_pcd(tmp_path: Path) -> None:
+    values = np.arange(40, dtype=np.int32) + 2**30
+    cloud = PointCloud(torus(40), {"normal_x": values})
+    assert format_named("pcd").left_behind(cloud) == []
+    np.testing.assert_array_equal(converted(cloud, "pcd", tmp_path).attributes["normal_x"], values)
+
+
 MANY = {f"column_{column}": np.zeros(9) for column in range(400)}
 NOT_FINITE = np.where(np.arange(27) == 5, np.nan, torus(9).ravel()).reshape(9, 3)
 CLOUDS = {
