@@ -15,9 +15,10 @@ __all__ = ["DENSE_FROM_RADII", "FEWEST_POINTS", "FEW_POINTS", "Calibration"]
 
 # d of noise that one pass takes most of: hardly any, little, and what leaves more of thin bodies (1.5 to 2 %).
 _LEAST_NOISE_DISTANCE, _LITTLE_NOISE_DISTANCE, _ONE_PASS_DISTANCE = 0.45, 0.75, 0.87
-# Up to this d, which says as much of shape as of noise, a second pass that is not due is made all the same where its
-# step would be less coherent (`model.coherence`) than the first, and one that is due is not from the second on.
-_FAINT_DISTANCE, _NOISE_COHERENCE, _SHAPE_COHERENCE = 0.25, 0.08, 0.15
+# Up to this d, which says as much of shape as of noise, a second pass that is not due is made all the same where what
+# it would take of the shape (the coherent part of its step, `model.coherence`) is less than the first share of what
+# points have moved, squared, and one that is due is not from the second on.
+_FAINT_DISTANCE, _LITTLE_TAKEN, _MUCH_TAKEN = 0.35, 0.009, 0.02
 _NOISE_COHERENCE_OF_SCENES = 0.12  # below it a scene gets a pass that is not due
 # What `stuck` is at least where no walls were seen, but for little noise. It rises there by so much for each radius of
 # a patch that the noise is above so many: of dense points a pass leaves more, and walls are read as little in radii.
@@ -138,18 +139,21 @@ class Calibration:
             return 0
         return 1 if done == most - 1 or (polishing and done == polished - 1 and not dense) else 2
 
-    def asks_for_coherence(self, distances: Sequence[float], points: int) -> bool:
-        """Say whether the number of passes of an object depends on how coherent the step of the next one would be."""
+    def asks_for_shape(self, distances: Sequence[float], points: int) -> bool:
+        """Say whether the number of passes of an object depends on what the next one would take of its shape."""
         return len(distances) == 2 and distances[0] < _FAINT_DISTANCE and points >= FEW_POINTS
 
-    def passes_by_coherence(self, left: int, coherence: float) -> int:
-        """Say how many passes to go, 0, 1 or 2, where `passes_left` says `left`, by how coherent the next step is."""
+    def passes_by_shape(self, left: int, taken: float) -> int:
+        """Say how many passes to go, 0, 1 or 2, where `passes_left` says `left`.
+
+        taken: of the mean square of how far points have moved, the share that is the coherent part of the next step.
+        """
         if left == 0:
-            return 1 if coherence < _NOISE_COHERENCE else 0
-        return left if coherence < _SHAPE_COHERENCE else 0
+            return 1 if taken < _LITTLE_TAKEN else 0
+        return left if taken < _MUCH_TAKEN else 0
 
     def passes_of_scene_by_coherence(self, coherence: float) -> int:
-        """Say how many passes of a scene to go, 0 or 1, where `passes_left` says 0, likewise."""
+        """Say how many passes of a scene to go, 0 or 1, where `passes_left` says 0, by the coherence of its step."""
         return 1 if coherence < _NOISE_COHERENCE_OF_SCENES else 0
 
     def _most_of_few(self, distances: Sequence[float], noise_in_radii: float, points: int, irregular: bool) -> int:

@@ -21,17 +21,20 @@ _PLANE_NEIGHBOURS, _PLANE_RATIO, _VOLUME_RATIO = 24, 0.4, 0.7
 _ROD_NEIGHBOURS, _WIDE_RATIO, _ROD_RATIO = 48, 0.6, 0.3
 
 
-def summed_coherence(step: Floats, points: Floats, patch: Floats) -> tuple[float, float]:
-    """Return two sums over n points that make a step (n, 3); the first by the second is how coherent it is.
+def summed_coherence(step: Floats, moved: Floats, points: Floats, patch: Floats) -> tuple[float, float, float]:
+    """Return three sums over n points that make a step (n, 3): the first by the second is how coherent it is.
 
-    points: (n, 3); patch: (P, 3), these and others around. Of moves along the normals, the products of each point's
-    with the mean of its neighbours', and its squares: 0 in all where neighbours move independently, 1 where alike.
+    moved: (n, 3), how far they are from where they came; points: (n, 3); patch: (P, 3), these and others around. Of
+    moves along the normals, the products of each point's with the mean of its neighbours', its squares, and those of
+    what it has moved: the first is 0 where neighbours move independently, the second where they all move alike.
     """
     if len(points) < 2:
-        return 0.0, 0.0
-    moves = _moves(step, points, neighbourhoods(points, patch, _NEIGHBOURS))
+        return 0.0, 0.0, 0.0
+    near = neighbourhoods(points, patch, _NEIGHBOURS)
+    moves = _moves(step, points, near)
     own, others = moves[:, 0], moves[:, 1:].mean(axis=1)
-    return float((own * others).sum()), float(np.square(own).sum())
+    before = (moved * near.normals).sum(axis=1)
+    return float((own * others).sum()), float(np.square(own).sum()), float(np.square(before).sum())
 
 
 def share_of_noise(step: Floats, points: Floats, patch: Floats) -> Floats:

@@ -223,7 +223,7 @@ class Run:
             return planned - self.iterations
         first, calibration, points = self.readings[0], self.filter.calibration, len(positions)
         object_ = not (first.scene or first.sampling.of_place or self.layers)
-        asked = object_ and calibration.asks_for_coherence(self.distances, points)
+        asked = object_ and calibration.asks_for_shape(self.distances, points)
         left = (calibration.of_scenes() if first.scene else calibration).passes_left(
             self.distances,
             first.noise_in_radii,
@@ -235,8 +235,9 @@ class Run:
         )
         if first.scene and first.height_axis is None and self.filter.zoom:
             left = self._passes_left_of_scene(left, positions)
-        elif asked and (coherence := self._coherence(positions)) is not None:
-            left = calibration.passes_by_coherence(left, coherence)
+        elif asked and (sums := self._sums_of_next(positions)) is not None:
+            products, _, moved = sums
+            left = calibration.passes_by_shape(left, products / max(moved, 1e-300))
         return max(left, _PASSES_OF_LAYERS - self.iterations) if self.layers else left
 
     def _passes_left_of_scene(self, left: int, positions: npt.NDArray[np.float64]) -> int:
@@ -246,11 +247,11 @@ class Run:
             return left
         if left == 1 or self.iterations == 0:
             return 2
-        coherence = self._coherence(positions)
-        return left if coherence is None else self.filter.calibration.passes_of_scene_by_coherence(coherence)
+        sums = self._sums_of_next(positions)
+        return left if sums is None else self.filter.calibration.passes_of_scene_by_coherence(sums[0] / sums[1])
 
-    def _coherence(self, positions: npt.NDArray[np.float64]) -> float | None:
-        """Return how coherent the next pass's step would be, by a few patches; None where they do not say."""
+    def _sums_of_next(self, positions: npt.NDArray[np.float64]) -> tuple[float, float, float] | None:
+        """Return the `summed_coherence` of the next pass's step, of a few patches; None where they do not say."""
         reading = self.readings[-1]
         if reading.probes is None:
             return None
@@ -265,15 +266,16 @@ class Run:
             inner = np.full(len(shown.cut.seeds), round(INNER_SHARE * shown.cut.index.shape[1]))
             shown = replace(shown, cut=replace(shown.cut, owned=inner))
 
-        def summed(patch: int, displacement: npt.NDArray[np.float64]) -> tuple[float, float]:
+        def summed(patch: int, displacement: npt.NDArray[np.float64]) -> tuple[float, float, float]:
             owned, step, _ = self._restrained_step(positions, shown, reading, patch, displacement)
-            return summed_coherence(step, positions[owned], positions.take(shown.cut.index[patch], axis=0))
+            around = positions.take(shown.cut.index[patch], axis=0)
+            return summed_coherence(step, self.moved[owned], positions[owned], around)
 
         found = self.filter.processor.displacements(
             positions, shown.cut, shown.scales, shown.known, summed, agree=False
         )
-        products, squares = np.sum([sums for sums in found if sums is not None], axis=0)
-        return float(products / squares) if squares > 0 else None
+        products, squares, moved = np.sum([sums for sums in found if sums is not None], axis=0).tolist()
+        return (products, squares, moved) if squares > 0 else None
 
     def _spread_step(
         self, positions: npt.NDArray[np.float64], tiling: Tiling | None, planned: int | None

@@ -14,7 +14,7 @@ from tests.clouds import even_sphere, noisy
 
 
 def coherence(step: npt.NDArray[np.float64], points: npt.NDArray[np.float64]) -> float:
-    products, squares = summed_coherence(step, points, points)
+    products, squares, _ = summed_coherence(step, np.zeros_like(step), points, points)
     return products / squares
 
 
@@ -35,10 +35,19 @@ def test_moves_along_the_surface_say_nothing() -> None:
     assert coherence(noise + np.array([0.1, 0.0, 0.0]), points) == pytest.approx(coherence(noise, points))
 
 
+def test_what_has_moved_counts_along_the_normals_alone() -> None:
+    rng = np.random.default_rng(2)
+    points = np.stack([*rng.uniform(size=(2, 500)), np.zeros(500)], axis=1)
+    moved = np.stack([*rng.normal(size=(2, 500)), rng.normal(size=500)], axis=1)
+    _, _, squares = summed_coherence(np.zeros_like(points), moved, points, points)
+    assert squares == pytest.approx(np.square(moved[:, 2]).sum())
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_points_have_no_neighbours_to_compare_with(count: int) -> None:
-    assert summed_coherence(np.ones((count, 3)), np.zeros((count, 3)), np.eye(3)) == (0.0, 0.0)
-    assert share_of_noise(np.ones((count, 3)), np.zeros((count, 3)), np.eye(3)).tolist() == [1.0] * count
+    step, points = np.ones((count, 3)), np.zeros((count, 3))
+    assert summed_coherence(step, step, points, np.eye(3)) == (0.0, 0.0, 0.0)
+    assert share_of_noise(step, points, np.eye(3)).tolist() == [1.0] * count
 
 
 def test_a_later_pass_of_a_scene_takes_noise_of_surfaces_and_nothing_of_shapes_rods_and_leaves() -> None:
@@ -56,16 +65,16 @@ def test_a_later_pass_of_a_scene_takes_noise_of_surfaces_and_nothing_of_shapes_r
         assert share_of_noise(0.01 * rng.normal(size=points.shape), points, points).mean() < 0.2
 
 
-def test_a_second_pass_is_made_where_its_step_is_noise_and_none_where_it_is_shape() -> None:
-    made = {c: [Calibration().passes_by_coherence(left, c) for left in (0, 2)] for c in (0.02, 0.1, 0.2)}
-    assert made == {0.02: [1, 2], 0.1: [0, 2], 0.2: [0, 0]}
+def test_a_second_pass_is_made_where_it_would_take_little_of_the_shape_beside_what_the_first_moved() -> None:
+    made = {taken: [Calibration().passes_by_shape(left, taken) for left in (0, 2)] for taken in (-0.01, 0.015, 0.05)}
+    assert made == {-0.01: [1, 2], 0.015: [0, 2], 0.05: [0, 0]}
     assert [Calibration().passes_of_scene_by_coherence(c) for c in (0.02, 0.1, 0.2)] == [1, 1, 0]
 
 
 def test_only_after_the_first_pass_of_little_noise_the_next_step_is_looked_at() -> None:
-    asks = Calibration().asks_for_coherence
-    assert asks((0.2, 0.13), 10_000)
-    assert not any([asks((0.2,), 10_000), asks((0.2, 0.13, 0.12), 10_000), asks((0.3, 0.13), 10_000)])
+    asks = Calibration().asks_for_shape
+    assert asks((0.3, 0.13), 10_000)
+    assert not any([asks((0.2,), 10_000), asks((0.2, 0.13, 0.12), 10_000), asks((0.5, 0.13), 10_000)])
     assert not asks((0.2, 0.13), 1000)
 
 
