@@ -107,6 +107,7 @@ class _Counting:
     def __init__(self, processor: Processor) -> None:
         self._processor, self.done = processor, list[tuple[int, int]]()
         self.distances, self.spread, self.survey = processor.distances, processor.spread, processor.survey
+        self.mapper = processor.mapper
         self.spacings = processor.spacings
 
     def displacements(

@@ -142,7 +142,7 @@ class NoiseReader:
         if first is None:
             axis = height_axis(positions) if self._zoom else None
             if view is None and axis is None and self._zoom:
-                view = View.of(positions, probes, self._origin, self._device)
+                view = View.of(positions, probes, self._origin, self._device, mapper=self._processor.mapper)
             radii = (_quantile(probes.radii, probes.owned, share) for share in (0.1, 0.5, 0.9))
             scene = axis is not None or is_scene(*radii)
         else:

@@ -32,6 +32,7 @@ from straightpcf.points.errors import TooLarge
 __all__ = ["Capture", "Graphs", "OnDevice", "capture_cuda_graph"]
 
 _T = TypeVar("_T")
+_Item = TypeVar("_Item")
 # A computation in -> how to do it again on what its inputs hold by then, and the tensor that it writes.
 Capture = Callable[[Callable[[], torch.Tensor]], tuple[Callable[[], object], torch.Tensor]]
 
@@ -207,6 +208,10 @@ class OnDevice:
             rising, found = reach[around].sort(dim=1).values, around.shape[1]
             among = (rising[:, (found - 1) // 2] + rising[:, found // 2]) / 2
             return reach.cpu().numpy(), among.cpu().numpy()
+
+    def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item], /) -> Iterable[_T]:
+        """Call it with one after the other: the device works on each."""
+        return map(function, items)
 
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
         """Look at all patches at once. Raises TooLarge where the device has no memory for them."""

@@ -98,7 +98,7 @@ class OnHost:
         """Look at some patches at a time, each time on a thread."""
         return survey(positions, patches, measure, mapper=self.mapper)
 
-    def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
+    def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item], /) -> Iterator[_T]:
         """Map in order, few results waiting."""
         pool = self._own_pool()
         waiting: deque[Future[_T]] = deque()

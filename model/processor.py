@@ -79,6 +79,9 @@ class Processor(Protocol):
         (N,) each; None where a tree is as quick. tiling: of these positions.
         """
 
+    def mapper(self, function: Callable[[_Item], _T], items: Iterable[_Item], /) -> Iterable[_T]:
+        """Do what a `Mapper` does; what torch does on the CPU it does there with one thread for each item."""
+
     def survey(self, positions: Floats, patches: Patches, measure: Measure[_T], /) -> Iterable[_T]:
         """Do what a `model.survey.Survey` does."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from straightpcf.model.patches import Patches
+from straightpcf.model.processor import Mapper
 
 __all__ = ["View", "along_beams"]
 
@@ -50,11 +52,13 @@ class View:
     nearness: float
 
     @classmethod
-    def of(cls, xyz: Floats, patches: Patches, origin: Floats | None, device: str) -> View | None:
+    def of(
+        cls, xyz: Floats, patches: Patches, origin: Floats | None, device: str, *, mapper: Mapper = map
+    ) -> View | None:
         """Return the view of points (N, 3) in the unit ball, None where they are no raster of beams.
 
         patches: some, spread over the cloud; origin: (3,), from which scanners count, which is tried first.
-        device: that looks at them.
+        device: that looks at them; mapper: calls a function with each of them, on threads if it has some.
         """
         if patches.index.shape[1] < _NEAREST or len(patches.seeds) < _FEWEST:
             return None
@@ -64,14 +68,15 @@ class View:
         if origin is not None and (seen := cls(origin, 1.0)).fits(some):
             return seen
         lines: list[Floats] = []
-        for number, raster in enumerate(some):
-            if number - len(lines) > (1 - _REGULAR_SHARE) * len(some):
-                return None
-            irregularity, direction = raster.most_regular(device)
+        others = 0
+        looked_at = mapper(partial(_Raster.most_regular, device=device), some)
+        for raster, (irregularity, direction) in zip(some, looked_at, strict=True):
             if irregularity <= _REGULAR_ALONG:
                 lines.append(np.concatenate([raster.points[0], direction]))
-        if len(lines) < _REGULAR_SHARE * len(some):
-            return None
+            else:
+                others += 1
+            if others > (1 - _REGULAR_SHARE) * len(some):
+                return None
         seen = cls._through(np.array(lines))
         if seen._mean_irregularity(some) > _HOPELESS:
             return None

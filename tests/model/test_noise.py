@@ -31,6 +31,7 @@ class Says:
         return np.minimum(noise * scales / 0.02, 1.0)  # the default calibration
 
     survey = staticmethod(survey)
+    mapper = map
 
 
 def tile(xyz: npt.NDArray[np.float64]) -> Tiling:

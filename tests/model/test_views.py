@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 
+from straightpcf.model import views
 from straightpcf.model.filter import load_filter
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.tiles import Tiling
 from straightpcf.model.views import View, along_beams
+from straightpcf.points.options import DenoiseOptions
 from tests.clouds import even_sphere, noisy, sphere, torus
 
 Floats = npt.NDArray[np.float64]
@@ -71,6 +76,19 @@ def test_a_file_of_few_digits_keeps_its_view() -> None:
     clean, beams = seen_from(4.0)
     xyz = np.round(along(clean, beams, 0.02), 4)  # a 200th of the distance between points
     assert view_of(xyz) is not None
+
+
+def test_the_view_is_looked_for_by_the_filters_threads_with_one_of_torchs_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    by: list[tuple[bool, int]] = []
+    most_regular = views._Raster.most_regular
+
+    def noted(raster: views._Raster, device: str) -> tuple[float, Floats]:
+        by.append((threading.current_thread() is threading.main_thread(), torch.get_num_threads()))
+        return most_regular(raster, device)
+
+    monkeypatch.setattr(views._Raster, "most_regular", noted)
+    load_filter(device="cpu", threads=2).denoise(noisy(torus(4000), 0.02), DenoiseOptions(iterations=1))
+    assert set(by) == {(False, 1)}  # else torch's threads wait for each other where a core is busy
 
 
 @pytest.mark.parametrize("noise_std", [0.0, 0.003, 0.01, 0.03])
