@@ -26,7 +26,7 @@ def summed_coherence(step: Floats, moved: Floats, points: Floats, patch: Floats)
 
     moved: (n, 3), how far they are from where they came; points: (n, 3); patch: (P, 3), these and others around. Of
     moves along the normals, the products of each point's with the mean of its neighbours', its squares, and those of
-    what it has moved: the first is 0 where neighbours move independently, the second where they all move alike.
+    what it has moved: the first is 0 where neighbours move independently, and the second where they all move alike.
     """
     if len(points) < 2:
         return 0.0, 0.0, 0.0

@@ -6,11 +6,14 @@ import asyncio
 import json
 import socket
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 import pytest
 
+from straightpcf.service.engine import Engine
 from tests.service.engines import submit, until
 from tests.service.fakes import CONTENT, Large, ObedientBackend
 from tests.service.in_process import serving
@@ -237,17 +240,11 @@ def test_one_whose_peer_closes_half_of_it_is_taken_for_gone_and_frees_the_worker
     """A peer that closed all of it sends no other sign; docs/api.md says so."""
 
     async def scenario() -> None:
-        backend = willing()
-        backend.finish.clear()
-        async with serving(tmp_path, backend) as (engine, host, port):
-            reader, writer = await asyncio.open_connection(host, port)
-            writer.write(POST)
-            await until(lambda: backend.runs)
+        async with _worked_on(tmp_path, POST) as (engine, _, reader, writer):
             writer.write_eof()
             assert await asyncio.wait_for(reader.read(), timeout=10) == b""
             while (await engine.list())[0]:
                 await asyncio.sleep(0.01)
-            writer.close()
 
     play(scenario)
 
@@ -258,19 +255,14 @@ def test_what_comes_behind_the_last_request_of_one_takes_its_answer_from_nobody(
     tmp_path: Path, last: bytes, behind: bytes
 ) -> None:
     async def scenario() -> None:
-        backend = willing()
-        backend.finish.clear()
-        async with serving(tmp_path, backend) as (_, host, port):
-            reader, writer = await asyncio.open_connection(host, port)
-            writer.write(POST.replace(b"HTTP/1.1\r\n", last))
-            await until(lambda: backend.runs)
+        asked = POST.replace(b"HTTP/1.1\r\n", last)
+        async with _worked_on(tmp_path, asked) as (_, backend, reader, writer):
             writer.write(behind)
             await asyncio.sleep(0.1)
             backend.finish.set()
             answer = await asyncio.wait_for(reader.read(), timeout=10)
             assert answer.startswith(b"HTTP/1.1 200 ")
             assert answer.endswith(b"\r\n\r\n" + CONTENT)
-            writer.close()
 
     play(scenario)
 
@@ -278,12 +270,7 @@ def test_what_comes_behind_the_last_request_of_one_takes_its_answer_from_nobody(
 @pytest.mark.parametrize("behind", [b"\r\n", GOOD])
 def test_one_that_is_closed_behind_a_further_request_frees_the_worker(tmp_path: Path, behind: bytes) -> None:
     async def scenario() -> None:
-        backend = willing()
-        backend.finish.clear()
-        async with serving(tmp_path, backend) as (engine, host, port):
-            _, writer = await asyncio.open_connection(host, port)
-            writer.write(POST)
-            await until(lambda: backend.runs)
+        async with _worked_on(tmp_path, POST) as (engine, backend, _, writer):
             for _ in range(3):
                 writer.write(behind)
                 await asyncio.sleep(0.05)
@@ -293,6 +280,21 @@ def test_one_that_is_closed_behind_a_further_request_frees_the_worker(tmp_path: 
             assert len(backend.canceled) == 1
 
     play(scenario)
+
+
+@asynccontextmanager
+async def _worked_on(
+    tmp_path: Path, request: bytes
+) -> AsyncIterator[tuple[Engine, ObedientBackend, asyncio.StreamReader, asyncio.StreamWriter]]:
+    """Serve one request that is being worked on until its backend is told to finish; give its connection, too."""
+    backend = willing()
+    backend.finish.clear()
+    async with serving(tmp_path, backend) as (engine, host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(request)
+        await until(lambda: backend.runs)
+        yield engine, backend, reader, writer
+        writer.close()
 
 
 async def _send_now_and_then(writer: asyncio.StreamWriter, *, seconds: float) -> None:
