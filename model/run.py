@@ -161,8 +161,8 @@ class Run:
                 return None
             self.steps = "the points are voxels: each was taken to be anywhere in its cell"
             return within_voxels(len(positions), edge, self.options.seed)
-        raster = reading.height_axis is not None
-        self.layers = layers = Layers.of(positions, reading.probes, raster=raster, survey=self.filter.processor.survey)
+        how = {"raster": reading.height_axis is not None, "in_lines": reading.sampling.in_lines}
+        self.layers = layers = Layers.of(positions, reading.probes, **how, survey=self.filter.processor.survey)
         if layers is None or not layers.wide:
             return None
         self.steps = f"the points lie in layers along {'xyz'[layers.axis]}: each was taken to be anywhere in its own"

@@ -79,7 +79,7 @@ def test_only_after_the_first_pass_of_little_noise_the_next_step_is_looked_at() 
 
 
 def test_a_ball_with_little_noise_gets_a_second_pass_and_ends_nearer_for_it() -> None:
-    shipped, noise = load_filter(device="cpu"), noisy(even_sphere(8000), 0.003)
+    shipped, noise = load_filter(device="cpu"), noisy(even_sphere(5000), 0.003)
     result = shipped.denoise(noise)
     assert result.iterations == 2
     assert shipped.calibration.passes_left(result.distances[:2]) == 0  # what d alone says after the first

@@ -9,6 +9,7 @@ import pytest
 from straightpcf.model.filter import load_filter
 from straightpcf.model.layers import Layers
 from straightpcf.model.patches import cut_patches
+from straightpcf.model.spacing import Sampling
 from tests.clouds import distance_to_torus, noisy, profiles, sphere, torus
 
 Floats = npt.NDArray[np.float64]
@@ -37,7 +38,9 @@ def rms_off_the_wall(xyz: Floats) -> float:
 
 
 def layers_of(xyz: Floats, *, raster: bool = False) -> Layers | None:
-    return Layers.of(xyz, cut_patches(xyz, coverage=3.0, seed=0), raster=raster)
+    patches = cut_patches(xyz, coverage=3.0, seed=0)
+    in_lines = Sampling.of(xyz, patches, 0.01).in_lines
+    return Layers.of(xyz, patches, raster=raster, in_lines=in_lines)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -103,7 +106,8 @@ def box() -> Floats:
         stairs(),
         slices(),
         sheet_in_profiles(),
-        profiles(0.005, 10, 38),
+        profiles(0.005, 10, 20),
+        profiles(0.014, 10, 20),
         floor_and_ball(),
         box(),
         np.round(box(), 2),
@@ -119,6 +123,7 @@ def box() -> Floats:
         "slices",
         "profiles",
         "noisy-profiles",
+        "noisier-profiles",
         "floor",
         "box",
         "rounded-box",
