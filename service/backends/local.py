@@ -110,7 +110,11 @@ class LocalBackend:
         except OSError as exc:  # no file descriptor, process or memory is left: others may let go of some
             raise WorkerDied(f"a worker could not be started ({exc})") from exc
         try:
-            self._warm[worker] = await asyncio.shield(worker.ready)
+            try:
+                self._warm[worker] = await asyncio.shield(worker.ready)
+            except WorkerDied:  # where there is no memory for the network, say, again and again
+                self.restarts += 1
+                raise
             self._idle.put_nowait(worker)
             logger.info("worker %s is ready on %s", worker.pid, self._warm[worker])
             await asyncio.shield(worker.died)

@@ -21,10 +21,15 @@ JOB = FileJob(id="1", source=Path("in"), target=Path("out"), options=DenoiseOpti
 
 
 class Workers:
-    """Stand in for WorkerProcess; the first `deaths` jobs kill their worker. faults: what the next starts meet."""
+    """Stand in for WorkerProcess; the first `deaths` jobs kill their worker.
 
-    def __init__(self, *faults: OSError, deaths: int = 0, failure: StraightPCFError | None = None) -> None:
-        self.faults, self.deaths, self.failure = list(faults), deaths, failure
+    faults: what the next starts meet. early: how many of the first die before they are ready.
+    """
+
+    def __init__(
+        self, *faults: OSError, early: int = 0, deaths: int = 0, failure: StraightPCFError | None = None
+    ) -> None:
+        self.faults, self.early, self.deaths, self.failure = list(faults), early, deaths, failure
         self.started = 0
 
     def __call__(self, spec: WorkerSpec) -> Worker:
@@ -41,6 +46,10 @@ class Worker:
         self.died: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         if owner.failure is not None:
             self.ready.set_exception(owner.failure)
+        elif owner.early > 0:
+            owner.early -= 1
+            self.died.set_result(None)
+            self.ready.set_exception(WorkerDied("killed before it was ready"))
         else:
             self.ready.set_result("cpu")
 
@@ -92,6 +101,14 @@ def test_a_worker_that_dies_is_told_and_the_next_job_gets_another(monkeypatch: p
     monkeypatch.setattr(local, "WorkerProcess", workers := Workers(deaths=1))
     backend = run_over_a_death()
     assert (workers.started, backend.restarts) == (2, 1)
+
+
+def test_a_worker_that_dies_before_it_is_ready_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "WorkerProcess", workers := Workers(early=2))
+    monkeypatch.setattr(local, "FIRST_RESTART_DELAY_SECONDS", 0.01)
+    backend = LocalBackend([SPEC])
+    assert run(backend) == [REPORT]
+    assert (workers.started, backend.restarts) == (3, 2)
 
 
 def test_many_jobs_share_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
