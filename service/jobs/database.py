@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.resources import files
@@ -18,6 +19,7 @@ __all__ = ["OpenedFile", "check_database", "open_database", "transaction"]
 SCHEMA_VERSION = 1
 _WAL_INDEX_HEAD = 136  # bytes: of the -wal the salts, the pages that are moved and those that are about to be
 _BUSY_SECONDS = 30.0  # while it is opened: of several servers that start at once, one upgrades it
+_AGAIN_SECONDS = 0.02
 # Every upload asks again and again for what is kept, beside the rows of all that has expired. Of a column that may have
 # to come first.
 _KEPT = "CREATE INDEX IF NOT EXISTS jobs_kept ON jobs (owner, spool) WHERE state <> 'expired'"
@@ -136,7 +138,7 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
     db.row_factory = sqlite3.Row
     if db.execute("PRAGMA page_count").fetchone()[0] == 0:  # a file that is there stays as it is
         db.execute("PRAGMA auto_vacuum = INCREMENTAL")
-    db.execute("PRAGMA journal_mode = WAL")
+    _write_ahead(db)
     db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives a power cut
     db.execute("PRAGMA foreign_keys = ON")
     (version,) = db.execute("PRAGMA user_version").fetchone()
@@ -148,6 +150,19 @@ def _prepare(db: sqlite3.Connection, path: Path) -> None:
         with transaction(db):  # of several servers that start at once, one
             _upgrade(db)
     db.execute(_KEPT)
+
+
+def _write_ahead(db: sqlite3.Connection) -> None:
+    """Let the file have a -wal. Where another server is about to do so to a new one, SQLite itself does not wait."""
+    until = time.monotonic() + _BUSY_SECONDS
+    while True:
+        try:
+            db.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError as exc:
+            if exc.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > until:
+                raise
+        time.sleep(_AGAIN_SECONDS)
 
 
 def _columns(db: sqlite3.Connection) -> set[str]:

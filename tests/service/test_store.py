@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import tempfile
+import threading
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
@@ -162,6 +163,19 @@ def test_servers_that_start_at_once_on_an_old_file_all_do(tmp_path: Path) -> Non
             for store in pool.map(JobStore, [path] * 3):
                 assert store.load().bytes == 12
                 store.close()
+
+
+def test_a_server_that_starts_while_another_makes_the_file_waits_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "jobs.sqlite3"
+    other = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+    other.execute("CREATE TABLE begun (x)")
+    other.execute("BEGIN IMMEDIATE")  # it has no -wal yet, and is written to
+    other.execute("INSERT INTO begun VALUES (1)")
+    end = threading.Timer(0.2, lambda: other.execute("COMMIT"))
+    end.start()
+    JobStore(path).close()
+    end.join()
+    other.close()
 
 
 def test_what_another_server_moves_into_the_database_during_a_look_is_no_overwriting(
