@@ -126,13 +126,13 @@ def run_worker(pipe: Connection, spec: WorkerSpec) -> None:
     except OSError as error:  # no such weights
         pipe.send(Failed(None, InternalError.code, str(error)))
         return
-    pipe.send(Ready(denoiser.device))
     try:
+        pipe.send(Ready(denoiser.device))
         while (job := pipe.recv()) is not None:
             if isinstance(job, FileJob):  # a Cancel that comes after its job has ended means nothing
                 pipe.send(_answer(denoiser, job, pipe))
-    except (EOFError, BrokenPipeError):
-        return  # the server is gone, and so is who would want the result
+    except (EOFError, ConnectionError):
+        return  # the server is gone, maybe before it read what was sent, and so is who would want the result
 
 
 def _load(spec: WorkerSpec) -> Filter:

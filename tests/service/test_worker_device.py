@@ -1,7 +1,8 @@
-"""An error ends a job; one after which a device answers no more ends its worker, so that another takes its place."""
+"""An error ends a job; one after which a device answers no more ends its worker, and so does the end of its server."""
 
 from __future__ import annotations
 
+import threading
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from straightpcf.points.errors import TooLarge
 from straightpcf.points.options import DenoiseOptions
 from straightpcf.service.backends import worker
 from straightpcf.service.backends.base import FileJob
-from straightpcf.service.backends.worker import Failed
+from straightpcf.service.backends.worker import Failed, WorkerSpec
 
 JOB = FileJob(id="1", source=Path("cloud"), target=Path("result"), options=DenoiseOptions(), max_points=1000)
 
@@ -43,3 +44,25 @@ def test_a_worker_whose_device_is_lost_ends(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_cpu_is_never_lost() -> None:
     assert not device.is_lost("cpu")
+
+
+@pytest.mark.parametrize("told", [False, True], ids=["while it loads", "before it reads that it is ready"])
+def test_a_worker_whose_server_is_killed_ends_without_a_traceback(told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = Pipe()
+
+    def load(spec: WorkerSpec) -> Any:
+        if not told:
+            ours.close()
+        return SimpleNamespace(device="cpu")
+
+    def die() -> None:
+        if ours.poll(20):
+            ours.close()
+
+    monkeypatch.setattr(worker, "_load", load)
+    monkeypatch.setattr(worker, "SERVERS_OWN", ())  # they are those of the tests
+    server = threading.Thread(target=die if told else lambda: None)
+    server.start()
+    with theirs:
+        worker.run_worker(theirs, WorkerSpec(device="cpu", weights=None, threads=None))
+    server.join()
