@@ -17,7 +17,7 @@ from scipy.ndimage import label
 from scipy.sparse.csgraph import connected_components
 
 from straightpcf.model.calibration import FEWEST_POINTS
-from straightpcf.model.distinct import box_of
+from straightpcf.model.distinct import Distinct, box_of, cell_of
 from straightpcf.model.normalize import CloudFrame
 from straightpcf.model.result import DenoiseResult, FinishedPatch
 from straightpcf.model.run import Run
@@ -95,19 +95,45 @@ def begin(owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> Run 
     Raises as `Filter.denoise` does.
     """
     run = Run(owner, points, options)
-    if not owner.zoom or len(run.points.xyz) < 2 * FEWEST_POINTS:
-        return run
-    objects = separate_objects(run.frame.enter(run.points.xyz))
+    objects = _objects_of(run) if owner.zoom else []
     return RunOfObjects(run, objects) if len(objects) > 1 else run
+
+
+def _objects_of(whole: Run) -> list[npt.NDArray[np.int64]]:
+    """Return the rows of the cloud that each of several objects has; none where all belong together."""
+    if whole.points.repeated and (objects := _objects_in_few_places(whole)):
+        return objects
+    if len(whole.points.xyz) < 2 * FEWEST_POINTS:
+        return []
+    objects = separate_objects(whole.frame.enter(whole.points.xyz))
+    if len(objects) == 1:
+        return []
+    return [whole.rows[whole.points.copies(rows.astype(np.int32))] for rows in objects]
+
+
+def _objects_in_few_places(whole: Run) -> list[npt.NDArray[np.int64]]:
+    """Do what `_objects_of` does where the cells of the cloud, made for its size, leave an object too few places.
+
+    Three objects of radius 1 that lie 1e5 apart have cells of 0.1 to 0.2, and in them less than 500 places each.
+    """
+    cloud, place = whole.xyz[whole.rows], whole.points.inverse
+    objects = separate_objects(whole.frame.enter(cloud)) if len(cloud) >= 2 * FEWEST_POINTS else []
+    hidden = False
+    for rows in objects if len(objects) > 1 else ():
+        alone = cloud[rows]
+        if len(Distinct(alone).xyz) < FEWEST_POINTS:  # copies, which are no object
+            return []
+        hidden |= len(np.unique(place[rows])) < FEWEST_POINTS <= len(Distinct(alone, cell=cell_of(alone)).xyz)
+    return [whole.rows[rows] for rows in objects] if hidden else []
 
 
 class RunOfObjects:
     """Several objects of one cloud on their way through the filter, pass by pass; as `Run` for who looks on."""
 
     def __init__(self, whole: Run, objects: list[npt.NDArray[np.int64]]) -> None:
-        """Take the cloud, not begun, and which of its distinct points each object has."""
+        """Take the cloud, not begun, and which of its rows each object has."""
         self._xyz, self._passed_through = whole.xyz, whole.passed_through()  # not what it has of the cloud as one
-        self._rows = [whole.rows[whole.points.copies(rows.astype(np.int32))] for rows in objects]
+        self._rows = objects
         self._runs = [Run(whole.filter, whole.xyz[rows], whole.options) for rows in self._rows]
 
     def patches(self) -> Iterator[FinishedPatch]:

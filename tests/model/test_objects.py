@@ -66,6 +66,26 @@ def test_each_object_ends_as_it_would_alone() -> None:
     )
 
 
+@pytest.mark.parametrize("away", [1e5, 1e7])
+def test_objects_so_far_apart_that_each_is_a_few_of_the_clouds_places_end_as_they_would_alone(
+    tiny: Filter, away: float
+) -> None:
+    ring, options = noisy(torus(600), 0.01), DenoiseOptions(iterations=1)
+    objects = [ring + np.array([number * away, 0, 0]) for number in range(3)]
+    result = tiny.denoise(np.vstack(objects), options)
+    np.testing.assert_array_equal(result.xyz, np.vstack([tiny.denoise(each, options).xyz for each in objects]))
+    assert result.warnings == ("the cloud is 3 objects far from each other: each was filtered as if it were alone",)
+
+
+def test_copies_of_few_points_make_no_object_of_them(tiny: Filter) -> None:
+    rings = np.vstack([noisy(torus(450), 0.01), noisy(torus(450), 0.01) + AWAY])
+    assert tiny.denoise(np.tile(rings, (3, 1)), DenoiseOptions(iterations=1)).warnings == ()
+    # By itself a sign for "no data", and too few points.
+    blob = np.vstack([np.tile(-9 * AWAY, (490, 1)), -9 * AWAY + 0.02 * sphere(20)])
+    far = np.vstack([noisy(torus(600), 0.01) + number * 1e5 * AWAY for number in range(3)])
+    assert len(tiny.denoise(np.vstack([far, blob]), DenoiseOptions(iterations=1)).xyz) == 2310
+
+
 def test_patches_of_several_objects_come_pass_by_pass_and_add_up(tiny: Filter) -> None:
     cloud = np.vstack([noisy(torus(1500), 0.01), noisy(torus(2500), 0.02) + AWAY])
     options = DenoiseOptions(iterations=2)
