@@ -85,7 +85,7 @@ class Run:
         self.readings: list[Reading] = []  # before each pass, and after the last
         self._rounds = ROUNDS  # of spreading, before each pass but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
-        origin = -self.frame.centre / max(self.frame.radius, 1e-300)
+        origin = -self.frame.centre / (self.frame.radius or np.inf)  # nobody asks for that of one place
         self.reader = NoiseReader(
             owner.processor, owner.calibration, self._tiling, zoom=owner.zoom, origin=origin, device=owner.device
         )

@@ -151,3 +151,11 @@ def test_near_copies_take_no_noise_away_from_the_filter(shipped: Filter) -> None
         moved = (result.xyz - copies)[np.argsort(rows, kind="stable")].reshape(-1, 3, 3)
         # Row i is still row i. A border of both grids may part copies, whose float32 coordinates differ in a last bit.
         np.testing.assert_allclose(moved, moved[:, :1].repeat(3, axis=1), rtol=1e-4, atol=1e-15)
+
+
+def test_all_points_in_one_place_are_said_once_however_far_out_that_is(shipped: Filter) -> None:
+    """Warnings of Python are errors here."""
+    cloud = np.tile([5e8, -4e9, 300.0], (50, 1))
+    result = shipped.denoise(cloud)
+    assert result.warnings == ("all points coincide: nothing to filter",)
+    np.testing.assert_array_equal(result.xyz, cloud)
