@@ -38,7 +38,8 @@ _Arrays = Mapping[str, npt.NDArray[np.generic]]
 def write_packed(path: Path, data: Sequence[Path], *, without: Sequence[int] = ()) -> None:
     """Pack the archives `data`, clean clouds or recorded ones, into one .npz; `without`: clouds of so many points.
 
-    Raises InvalidOptions where two archives have one name, MalformedFile, OSError.
+    Normals go with the cloud that they are of. Raises InvalidOptions where two archives have one name, MalformedFile,
+    OSError.
     """
     by_stem(data)
     index: list[list[object]] = []
@@ -47,11 +48,11 @@ def write_packed(path: Path, data: Sequence[Path], *, without: Sequence[int] = (
     others: dict[str, npt.NDArray[np.generic]] = {}
     for archive in data:
         with opened(archive) as file:
-            arrays = {name: file[name] for name in file.files if name.rpartition("/")[2] not in map(str, without)}
+            arrays = {name: file[name] for name in file.files}
         finest = {_finest_beside(name, arrays): name for name in arrays if name.endswith("/normals")}
         for name, values in arrays.items():
             place = f"{archive.stem}/{name}"
-            if name in finest.values():
+            if name in finest.values() or name.rpartition("/")[2] in map(str, without):
                 continue
             if values.ndim != 2:
                 others[place] = values

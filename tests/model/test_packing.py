@@ -65,6 +65,16 @@ def test_what_is_unpacked_is_trained_on(clean: Path, tmp_path: Path) -> None:
     assert path.stat().st_size > 4 * packed.stat().st_size
 
 
+def test_normals_of_a_cloud_that_is_left_out_are_left_out(tmp_path: Path) -> None:
+    ball = sphere(3000)  # its own normals
+    np.savez(path := tmp_path / "balls.npz", **{"s0/3000": ball, "s0/1000": sphere(1000, 1), "s0/normals": ball})  # type: ignore[arg-type]
+    for without, kept in ([3000], {"s0/1000"}), ([1000], {"s0/3000", "s0/normals"}):
+        write_packed(packed := tmp_path / "carried.npz", [path], without=without)
+        (unpacked,) = unpack_archives(packed, tmp_path / "there")
+        with np.load(unpacked) as found:
+            assert {*found.files} == kept
+
+
 def test_archives_of_one_name_are_refused(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (other := tmp_path / "other" / "clean.npz").write_bytes(clean.read_bytes())
