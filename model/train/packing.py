@@ -48,7 +48,7 @@ def write_packed(path: Path, data: Sequence[Path], *, without: Sequence[int] = (
     others: dict[str, npt.NDArray[np.generic]] = {}
     for archive in data:
         with opened(archive) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: _checked(file[name], archive, name) for name in file.files}
         finest = {_finest_beside(name, arrays): name for name in arrays if name.endswith("/normals")}
         for name, values in arrays.items():
             place = f"{archive.stem}/{name}"
@@ -61,6 +61,10 @@ def write_packed(path: Path, data: Sequence[Path], *, without: Sequence[int] = (
             index.append([place, len(values), centre.tolist(), half])
             codes.append(np.diff(code, prepend=np.uint64(0)))
             if name in finest:
+                if len(arrays[finest[name]]) != len(values):
+                    raise MalformedFile(
+                        f"{archive}: {finest[name][:80]} has {len(arrays[finest[name]])} rows for {len(values)} points"
+                    )
                 index.append([f"{archive.stem}/{finest[name]}", len(values)])
                 normals.append(
                     np.diff(_octahedral(arrays[finest[name]][order]), axis=0, prepend=np.zeros((1, 2), np.uint8))
@@ -107,6 +111,15 @@ def unpack_archives(path: Path, into: Path) -> list[Path]:
     for each, arrays in zip(paths, archives.values(), strict=True):
         write_archive(each, arrays)
     return paths
+
+
+def _checked(values: object, archive: Path, name: str) -> npt.NDArray[np.generic]:
+    """Return what an archive holds under a name; raises MalformedFile of what is no array, and of two axes no cloud."""
+    if not isinstance(values, np.ndarray):  # of another member, bytes
+        raise MalformedFile(f"{archive}: {name[:80]} is no array")
+    if values.ndim == 2 and (values.shape[1] != 3 or len(values) == 0 or values.dtype.kind not in "fiu"):
+        raise MalformedFile(f"{archive}: {name[:80]} is {values.dtype} {values.shape}; it must be (N, 3) numbers")
+    return values
 
 
 def _finest_beside(name: str, arrays: _Arrays) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,31 @@ def test_what_is_no_cloud_is_refused_with_its_name(tmp_path: Path) -> None:
     np.savez(path := tmp_path / "flat.npz", **{"s0/2000": np.zeros((2000, 3))})  # type: ignore[arg-type]
     with pytest.raises(MalformedFile, match=r"flat\.npz: s0/2000 is no cloud"):
         write_packed(tmp_path / "carried.npz", [path])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"s0/9": np.ones((9, 4))}, r"s0/9 is float64 \(9, 4\); it must be \(N, 3\) numbers"),
+        ({"s0/0": np.ones((0, 3))}, r"s0/0 is float64 \(0, 3\)"),
+        ({"s0/9": np.full((9, 3), "a")}, r"s0/9 is <U1 \(9, 3\)"),
+        ({"s0/9": sphere(9), "s0/normals": sphere(8)}, "s0/normals has 8 rows for 9 points"),
+    ],
+    ids=["four columns", "none", "text", "normals of others"],
+)
+def test_arrays_of_other_kinds_are_refused_with_their_names(
+    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+) -> None:
+    np.savez(path := tmp_path / "odd.npz", **arrays)  # type: ignore[arg-type]
+    with pytest.raises(MalformedFile, match=rf"odd\.npz: {said}"):
+        write_packed(tmp_path / "carried.npz", [path])
+
+
+def test_a_member_that_is_no_array_is_refused_with_its_name(clean: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(clean, "a") as archive:
+        archive.writestr("README.txt", "who made these")
+    with pytest.raises(MalformedFile, match=r"clean\.npz: README\.txt is no array"):
+        write_packed(tmp_path / "carried.npz", [clean])
 
 
 def test_a_file_that_was_not_packed_or_is_broken_is_refused(clean: Path, tmp_path: Path) -> None:
