@@ -80,6 +80,8 @@ def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - it is no mapping
     except (SafetensorError, ValueError) as exc:
         raise MalformedFile(f"{path} is no safetensors file: {exc}") from exc
+    if "progress" in texts:
+        raise MalformedFile(f"{path} is the state of a training run: docs/training.md says how weights are made of it")
     if texts.get("format") != FORMAT:
         raise MalformedFile(f"{path} has the format {texts.get('format')!r} in its metadata, expected {FORMAT!r}")
     try:

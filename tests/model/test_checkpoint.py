@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -27,7 +28,8 @@ from straightpcf.model.checkpoint import (
 )
 from straightpcf.model.filter import load_filter
 from straightpcf.model.nets.straightpcf import StraightPCF, VelocityModule
-from straightpcf.model.train.state import read_network
+from straightpcf.model.train.soap import SOAP
+from straightpcf.model.train.state import Average, read_network, save_state
 from straightpcf.points.errors import MalformedFile
 
 SMALL = {"couplings": 2, "width": 16, "distance_width": 8}
@@ -249,3 +251,13 @@ def test_a_folder_is_named_as_one(tmp_path: Path) -> None:
     for read in (load_checkpoint, read_network):
         with pytest.raises(IsADirectoryError, match=str(tmp_path)):
             read(tmp_path)
+
+
+def test_the_state_of_a_training_run_is_named_as_one_where_weights_are_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "state.safetensors"
+    network, rng = StraightPCF(couplings=1), np.random.default_rng(0)
+    save_state(path, network, Average(network, 0.9), SOAP(network.parameters()), rng, {"stage": "vm", "iteration": 1})
+    with pytest.raises(
+        MalformedFile, match=r"state\.safetensors is the state of a training run: docs/training\.md says"
+    ):
+        load_filter(path, device="cpu")
