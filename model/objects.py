@@ -41,7 +41,8 @@ def separate_objects(xyz: Floats) -> list[npt.NDArray[np.int64]]:
     """Return the rows of each object among points of the unit ball (N, 3); of one where all belong together.
 
     Objects are what empty cells of a grid part and whose bounding spheres do not meet: legs of a chair, plates over
-    each other or a street's houses are parts of one. Groups of fewer than FEWEST_POINTS belong to the nearest object.
+    each other or a street's houses are parts of one. Each is looked at again by itself. Groups of fewer than
+    FEWEST_POINTS belong to the nearest object.
     """
     whole = [np.arange(len(xyz))]
     numbers = _pieces(xyz)
@@ -66,7 +67,9 @@ def separate_objects(xyz: Floats) -> list[npt.NDArray[np.int64]]:
         if len(rows) < FEWEST_POINTS:
             nearest = np.argmin(np.linalg.norm(centres - xyz[rows].mean(axis=0), axis=1) - radii)
             members[nearest].append(rows)
-    return [np.sort(np.concatenate(of)) for of in members]
+    parted = [np.sort(np.concatenate(of)) for of in members]
+    # By itself each has finer cells, which may part it: two that lie near each other beside a third one.
+    return [rows[part] for rows in parted for part in separate_objects(xyz[rows])]
 
 
 def _rows_of(labels: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:

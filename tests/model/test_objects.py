@@ -24,6 +24,16 @@ def test_what_lies_far_from_the_rest_is_an_object_of_its_own() -> None:
     assert parted(torus(3000), 0.1 * torus(600) + AWAY) == [3000, 600]
 
 
+def test_two_that_are_near_each_other_beside_a_third_one_are_two() -> None:
+    assert parted(torus(1500), torus(900) + AWAY, torus(1200) + 300 * AWAY) == [1500, 900, 1200]
+    assert parted(torus(1500), torus(900) + AWAY, torus(1200) + 300 * AWAY, torus(600) + 9000 * AWAY) == [
+        1500,
+        900,
+        1200,
+        600,
+    ]
+
+
 def test_a_small_group_belongs_to_the_nearest_object() -> None:
     beside = 0.02 * sphere(30) + AWAY + [0.0, 2.0, 0.0]
     assert parted(torus(3000), torus(2000) + AWAY, beside) == [3000, 2030]
