@@ -184,7 +184,7 @@ class RunOfObjects:
             before,
             after,
             parts[longest].distances,
-            len(out) - sum(sizes) + sum(part.untouched for part in parts),
+            len(out) - sum(map(len, self._rows)) + sum(part.untouched for part in parts),
             seconds,
             tuple(warnings),
         )

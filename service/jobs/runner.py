@@ -197,7 +197,12 @@ class JobRunner:
             return
         match running.task.exception():
             case None:
-                await self._deliver(claim, running.task.result())
+                try:
+                    await self._deliver(claim, running.task.result())
+                except DISK_TROUBLES:
+                    raise
+                except Exception as fault:  # no later attempt would write it down either
+                    await self._fail_on(claim, fault)
             case WorkerDied() as death:
                 await self._after_death(claim, death, "its worker died")
             case FilesUnusable() as trouble:
@@ -206,8 +211,7 @@ class JobRunner:
                 logger.info("job %s: %s: %s%s", claim.record.id, error.code, error.message, _trace(claim))
                 await self._fail(claim, error)
             case fault:
-                logger.error("job %s: %r%s", claim.record.id, fault, _trace(claim), exc_info=fault)
-                await self._fail(claim, InternalError("the server failed on this job; its log says how"))
+                await self._fail_on(claim, fault)
 
     async def _deliver(self, claim: Claim, report: FileReport) -> None:
         record = claim.record
@@ -233,6 +237,10 @@ class JobRunner:
         else:
             error = InternalError(f"{told}, {MAX_DEATHS} times; the cloud was then given up")
             await self._fail(claim, error)
+
+    async def _fail_on(self, claim: Claim, fault: BaseException) -> None:
+        logger.error("job %s: %r%s", claim.record.id, fault, _trace(claim), exc_info=fault)
+        await self._fail(claim, InternalError("the server failed on this job; its log says how"))
 
     async def _fail(self, claim: Claim, error: StraightPCFError) -> None:
         await self._call(JobStore.fail, claim.record.id, claim.fence, error, expires_in=self._ttl)

@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from straightpcf.service.jobs import runner
 from straightpcf.service.jobs.folders import JobFolders
 from straightpcf.service.jobs.record import Claim
 from straightpcf.service.jobs.store import MAX_SERVER_DEATHS, Hold, JobStore
+from tests.service import fakes
 from tests.service.engines import fill, kinds, make_room, play, run_first_and_fill, running, submit, until
 from tests.service.fakes import CONTENT, ObedientBackend
 
@@ -169,6 +171,18 @@ def test_a_fault_of_the_server_ends_the_job_and_not_the_server(tmp_path: Path) -
         assert (await engine.wait((await submit(engine))[0].id)).state == "succeeded"
 
     play(tmp_path, scenario, ZeroDivisionError("a bug"))
+
+
+def test_a_result_that_can_never_be_written_down_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fakes, "REPORT", replace(fakes.REPORT, untouched=np.int64(0)))  # which is no JSON
+
+    async def scenario(engine: Engine, backend: ObedientBackend) -> None:
+        backend.go.set()
+        backend.finish.set()
+        ended = await engine.wait((await submit(engine))[0].id)
+        assert (ended.state, type(ended.error), ended.attempts) == ("failed", InternalError, 1)
+
+    play(tmp_path, scenario)
 
 
 def test_a_cancel_that_comes_between_a_claim_and_the_jobs_first_step_ends_it(

@@ -77,6 +77,12 @@ def test_strength_zero_gives_the_input_back(server: RunningServer, cloud: Path) 
     np.testing.assert_array_equal(load(answer), np.load(cloud))
 
 
+def test_several_objects_in_one_cloud_are_denoised_and_reported(server: RunningServer, tmp_path: Path) -> None:
+    np.save(path := tmp_path / "two.npy", np.vstack([noisy(torus(600), 0.01), noisy(torus(600), 0.01) + 100.0]))
+    answer = curl("-F", f"file=@{path}", "-F", "iterations=1", "--max-time", "60", f"{server.url}/denoise")
+    assert (answer.status, answer.headers["x-points"], answer.headers["x-untouched"]) == (200, "1200", "0")
+
+
 def test_rows_that_are_not_finite_pass_through(server: RunningServer, tmp_path: Path) -> None:
     xyz = noisy(torus(POINTS), 0.01)
     xyz[3], xyz[399] = np.nan, np.inf
