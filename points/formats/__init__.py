@@ -19,6 +19,7 @@ from straightpcf.points.errors import (
     UnsupportedCloud,
 )
 from straightpcf.points.formats.base import DEFAULT_MAX_POINTS, HEAD_BYTES, Format
+from straightpcf.points.formats.e57 import E57
 from straightpcf.points.formats.kitti import Kitti
 from straightpcf.points.formats.las import Las, Laz
 from straightpcf.points.formats.npy import Npy
@@ -41,7 +42,7 @@ __all__ = [
     "write_cloud",
 ]
 
-FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), Npy(), Npz(), Xyz(), Csv(), Tsv(), Pts(), Kitti())
+FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), E57(), Npy(), Npz(), Xyz(), Csv(), Tsv(), Pts(), Kitti())
 
 # Endings of files that would pass for another format's, and be scrambled.
 _NOT_OURS = {
@@ -57,7 +58,6 @@ _THREE, _FOUR = (rb"[ \t]*" + rb"[ \t]+".join([rb"[-+.\deE]+"] * count) + rb"[ \
 _FOREIGN = (
     # CloudCompare saves it by default, under the suffix of KITTI's frames: CCB2 and the like.
     (re.compile(rb"CCB[0-?]"), "a BIN file of CloudCompare's own: save it as PLY or LAS there"),
-    (re.compile(rb"ASTM-E57"), "an E57 file: save it as PLY or LAS, with CloudCompare or PDAL"),
     (
         re.compile(_WHOLE * 2 + _THREE * 4 + _FOUR * 4),
         "a PTX file, whose scans have a pose each: save it as PTS, PLY or LAS, with CloudCompare or its own program",

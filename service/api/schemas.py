@@ -236,11 +236,12 @@ class Health(BaseModel):
 
 
 class FormatInfo(BaseModel):
-    """Describe one file format."""
+    """Describe one file format; written: whether a result can be of it."""
 
     name: str
     suffixes: list[str]
     media_type: str
+    written: bool
 
 
 class Info(BaseModel):
@@ -271,7 +272,12 @@ class Info(BaseModel):
             max_iterations=MAX_ITERATIONS,
             **{name: getattr(engine.limits, name) for name in names},
             formats=[
-                FormatInfo(name=format.name, suffixes=list(format.suffixes), media_type=format.media_type)
+                FormatInfo(
+                    name=format.name,
+                    suffixes=list(format.suffixes),
+                    media_type=format.media_type,
+                    written=format.is_written,
+                )
                 for format in FORMATS
             ],
         )
