@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["distance_to_torus", "even_sphere", "far_group", "noisy", "sphere", "torus"]
+__all__ = ["distance_to_torus", "even_sphere", "far_group", "noisy", "profiles", "sphere", "torus"]
 
 _RING, _TUBE = 0.7, 0.3
 
