@@ -27,9 +27,6 @@ _FEWEST_LAYERS = 4  # that have such points
 # How far apart layers are beside the points in them: floors without noise are much nearer to the next coordinate that
 # there is, the steps of stairs much farther from it. To the network those from the middle one on are surfaces.
 _LEAST_WIDTH, _WIDE, _MOST_WIDTH = 0.5, 1.25, 10.0
-# So far apart they are a scanner's profiles, whatever noise in their planes hides of that, if most of the nearest lie
-# exactly in one: of a depth camera's frames with as little noise layers are nearer, 3.8 in the room of the benchmarks.
-_MOST_WIDTH_IN_LINES = 5.0
 # Of a point's nearest as seen along the axis, so many may share its layer. Without noise, layers that are wide beside a
 # patch stay steps, whatever is done, and that of a wall that is seen from the front is the wall.
 _BESIDE, _MIXED_SHARE = 8, 0.85
@@ -54,10 +51,11 @@ class Layers:
     ) -> Layers | None:
         """Look for layers in some patches of points (N, 3); None where there are none.
 
-        raster: whether the points are one, whose other coordinates have steps of their own; in_lines: as of `Sampling`.
+        raster: whether the points are one, whose other coordinates have steps of their own; in_lines: whether they are
+        of a scanner's lines (`Sampling`), which share a coordinate, too.
         """
         axes = [axis for axis in range(3) if repeats(xyz[:, axis], _POINTS_A_LAYER)]
-        if not axes:
+        if in_lines or not axes:
             return None
         layered, spacings, where = map(np.concatenate, zip(*survey(xyz, patches, _layered), strict=True))
         shares = layered.mean(axis=0)
@@ -71,8 +69,7 @@ class Layers:
         widths, seen = _widths(lines), layered[:, axis]
         at = np.searchsorted(lines, where[seen, axis])
         in_spacings = float(np.median(widths[at] / spacings[seen]))
-        most_width = _MOST_WIDTH_IN_LINES if in_lines else _MOST_WIDTH
-        if len(np.unique(at)) < _FEWEST_LAYERS or not _LEAST_WIDTH <= in_spacings <= most_width:
+        if len(np.unique(at)) < _FEWEST_LAYERS or not _LEAST_WIDTH <= in_spacings <= _MOST_WIDTH:
             return None
         rounded = [float(np.median(np.diff(np.unique(xyz[:, other])))) for other in axes if other != axis]
         if not raster and any(_BESIDE_OTHERS * step > np.median(widths[at]) for step in rounded):

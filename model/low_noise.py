@@ -19,6 +19,7 @@ from straightpcf.model.neighbourhoods import Nearest, Neighbourhoods, surface_te
 __all__ = [
     "EXACT_PLANE_RATIO",
     "FIT_NEIGHBOURS",
+    "HIGH_NOISE_RATIO",
     "LINES_NEIGHBOURS",
     "SCENE_NEIGHBOURS",
     "NeighbourhoodNoise",
@@ -38,7 +39,7 @@ _RIDGE = 1e-9  # points in a line have a surface, too; in units of the neighbour
 # bends and thin parts. It is not that of the whole patch, for noise may differ from place to place.
 _NOISE_QUANTILE, _NOISE_NEIGHBOURS = 0.25, 80
 # Noise beside the radius of the 16: up to the first a cloud has little, from the second on it has not at all.
-_LOW_NOISE_RATIO, _HIGH_NOISE_RATIO = 0.05, 0.08
+_LOW_NOISE_RATIO, HIGH_NOISE_RATIO = 0.05, 0.08
 # A point so many times that noise from its neighbours' surface, of which the network takes off so much, is one
 # with more noise than the others.
 _OUTLIER_STDS, _OUTLIER_STEP_SHARE = 6.0, 0.6
@@ -72,12 +73,14 @@ class NeighbourhoodNoise:
     """What surfaces fitted to neighbours leave of the points of M patches, all (M,).
 
     in_radii, stds: their noise, in radii of the neighbourhoods and in the unit of the points; loud_shares: how many of
-    them are many times that noise off their neighbours' surface.
+    them are many times that noise off their neighbours' surface; breadths: how broad the neighbourhoods are beside
+    their length, as stds.
     """
 
     in_radii: Floats
     stds: Floats
     loud_shares: Floats
+    breadths: Floats
 
     @classmethod
     def of(cls, near: Nearest, patches: int) -> NeighbourhoodNoise:
@@ -96,7 +99,9 @@ class NeighbourhoodNoise:
         quantile = namespace(left).quantile
         stds = quantile(left, _NOISE_QUANTILE, 1)
         loud_shares = (abs(own) > _OUTLIER_STDS * stds[:, None]).sum(1) / own.shape[1]
-        return cls(*map(on_host, (quantile(left / radii, _NOISE_QUANTILE, 1), stds, loud_shares)))
+        variances = near.variances.clip(min=np.finfo(np.float64).tiny).reshape(patches, -1, 3)
+        breadths = quantile(variances[:, :, 1] / variances[:, :, 2], 0.5, 1) ** 0.5
+        return cls(*map(on_host, (quantile(left / radii, _NOISE_QUANTILE, 1), stds, loud_shares, breadths)))
 
 
 def low_noise_weight(ratios: Floats) -> float:
@@ -105,7 +110,7 @@ def low_noise_weight(ratios: Floats) -> float:
     1: a surface fitted to neighbours reads the noise well. 0: noise hides it. ratios: (M,), as of
     `NeighbourhoodNoise.in_radii`, of some patches, of which half say.
     """
-    return float(np.clip((_HIGH_NOISE_RATIO - np.median(ratios)) / (_HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
+    return float(np.clip((HIGH_NOISE_RATIO - np.median(ratios)) / (HIGH_NOISE_RATIO - _LOW_NOISE_RATIO), 0.0, 1.0))
 
 
 def wiener_weighted(step: Floats, nearest: Nearest, low_noise: float) -> Floats:
