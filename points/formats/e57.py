@@ -120,9 +120,10 @@ def _pose(scan: ElementTree.Element) -> tuple[npt.NDArray[np.float64], npt.NDArr
 
 
 def _together(scans: list[_Columns]) -> _Columns:
-    """Return what all scans have, scan after scan."""
-    common = [name for name in scans[0] if all(name in scan for scan in scans)]
-    return {name: np.concatenate([scan[name] for scan in scans]) for name in common}
+    """Return what all scans have that are of any points, scan after scan."""
+    filled = [scan for scan in scans if len(scan[_CARTESIAN[0]])] or scans
+    common = [name for name in filled[0] if all(name in scan for scan in filled)]
+    return {name: np.concatenate([scan[name] for scan in filled]) for name in common}
 
 
 def _beside(file: E57File, packed: list[E57Points], columns: _Columns) -> tuple[str, ...]:

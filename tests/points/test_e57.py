@@ -140,6 +140,19 @@ def test_what_not_all_scans_have_is_left_behind_by_name(tmp_path: Path) -> None:
     assert set(cloud.beside) == {"intensity", "colorRed", "colorGreen", "colorBlue", "rowIndex", "columnIndex"}
 
 
+def test_a_scan_of_no_points_takes_no_field_from_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "a.e57"
+    with pye57.E57(str(path), mode="w") as file:
+        bare = {name: values for name, values in scanned(60, 1).items() if name.startswith("cartesian")}
+        file.write_scan_raw(bare, name="bare")
+        file.write_scan_raw(scanned(50, 2), name="whole")
+    _patched(path, b'recordCount="60"', b'recordCount="0"')
+    cloud, _ = read_cloud(path)
+    assert list(cloud.attributes) == ["intensity", "red", "green", "blue", "rowIndex", "columnIndex", "scan"]
+    assert set(cloud.attributes["scan"]) == {1}
+    assert cloud.beside == ()
+
+
 def test_a_scan_becomes_a_file_of_another_format_with_its_colours(two_scans: Path, tmp_path: Path) -> None:
     cloud, source = read_cloud(two_scans)
     write_cloud(cloud, tmp_path / "a.las", format_named("las"))
