@@ -104,6 +104,8 @@ def begin(owner: Filter, points: npt.ArrayLike, options: DenoiseOptions) -> Run 
 
 def _objects_of(whole: Run) -> list[npt.NDArray[np.int64]]:
     """Return the rows of the cloud that each of several objects has; none where all belong together."""
+    if len(whole.points.xyz) == 1:  # a frame of no size
+        return []
     if whole.points.repeated and (objects := _objects_in_few_places(whole)):
         return objects
     if len(whole.points.xyz) < 2 * FEWEST_POINTS:

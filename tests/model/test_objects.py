@@ -96,6 +96,13 @@ def test_copies_of_few_points_make_no_object_of_them(tiny: Filter) -> None:
     assert len(tiny.denoise(np.vstack([far, blob]), DenoiseOptions(iterations=1)).xyz) == 2310
 
 
+def test_any_number_of_points_in_one_place_is_filtered_without_a_warning_of_numpys(tiny: Filter) -> None:
+    cloud = np.tile([448000.25, 5411000.5, 310.0], (1000, 1))
+    result = tiny.denoise(cloud)
+    np.testing.assert_array_equal(result.xyz, cloud)
+    assert result.warnings == ("all points coincide: nothing to filter",)
+
+
 def test_patches_of_several_objects_come_pass_by_pass_and_add_up(tiny: Filter) -> None:
     cloud = np.vstack([noisy(torus(1500), 0.01), noisy(torus(2500), 0.02) + AWAY])
     options = DenoiseOptions(iterations=2)
