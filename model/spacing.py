@@ -43,7 +43,7 @@ _BELIEVED_RATIO = 1.5
 _STRONG_NOISE, _HARDLY_HIDING_SHARE, _HIDING_AND_SHOWING = 0.025, 0.18, 0.95
 _ROUNDS_OF_ONE_SURFACE, _ROUNDS_OF_WALLS = 1, 4
 # Where the nearest 16 are of one line of a scanner's, in the plane of its beams, they are 0.02 to 0.65 times as broad
-# as long, on surfaces 0.76 and more; and 16 of the 64 nearest that lie in all directions show 3 times their noise and
+# as long, on surfaces 0.72 and more; and 16 of the 64 nearest that lie in all directions show 3 times their noise and
 # more, both in radii, of other clouds 0.7 to 1.7 times, but for walls close together.
 _LINES_BREADTH, _LINES_NOISE_RATIO = 0.7, 2.5
 _LEAST_PATCH_POINTS = 100  # points of a patch; of fewer a third have the nearest 32 in common
