@@ -123,7 +123,7 @@ class E57File:
         if (major, page) != (1, _PAGE):
             raise UnsupportedCloud(f"version {major} of E57 in pages of {page} bytes is not known; 1 in {_PAGE} is")
         check_room(length, len(raw), what="the E57 file, says its header, which")
-        self._pages = np.frombuffer(raw, np.uint8, len(raw) // _PAGE * _PAGE).reshape(-1, _PAGE)
+        self._pages = np.frombuffer(raw, np.uint8, length // _PAGE * _PAGE).reshape(-1, _PAGE)
         self._check()
         xml = self.logical(_unpaged(xml_offset), xml_length, what="the XML of the E57 file")
         if b"<!DOCTYPE" in xml:  # entities could make anything of it

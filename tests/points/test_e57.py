@@ -179,6 +179,12 @@ def test_points_that_take_no_bits_are_no_bomb(tmp_path: Path) -> None:
         read_cloud(path)
 
 
+def test_what_lies_behind_a_file_is_no_part_of_it(two_scans: Path) -> None:
+    cloud, _ = read_cloud(two_scans)
+    two_scans.write_bytes(two_scans.read_bytes() + bytes(3000))
+    np.testing.assert_array_equal(read_cloud(two_scans)[0].xyz, cloud.xyz)
+
+
 def test_a_damaged_page_is_named(two_scans: Path) -> None:
     raw = bytearray(two_scans.read_bytes())
     raw[5000] ^= 1
