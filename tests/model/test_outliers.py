@@ -43,8 +43,9 @@ def floor_around_a_scanner(count: int) -> np.ndarray:
     return np.stack([away * np.cos(turn), away * np.sin(turn), np.full(count, -1.8)], axis=1)
 
 
+@pytest.mark.parametrize("reach", [1.3, 4.0, 1000.0])
 # Between these levels of noise a last bit decides whether `auto` polishes this torus.
-@pytest.mark.parametrize(("noise_std", "reach"), [(0.004, 1.3), (0.004, 1000.0), (0.01, 1.3), (0.01, 4.0)])
+@pytest.mark.parametrize("noise_std", [0.004, 0.01])
 def test_a_hundredth_of_points_in_the_air_changes_little_for_the_others(
     shipped: Filter,
     filtered_alone: Callable[[float], tuple[np.ndarray, DenoiseResult]],

@@ -40,15 +40,14 @@ def test_lines_are_not_even() -> None:
     assert not irregular(squares, 0.01)
 
 
-@pytest.mark.parametrize(("noise_std", "ratio"), [(0.014, 10), (0.015, 7)])  # as large as the points are apart
+@pytest.mark.parametrize(("noise_std", "ratio"), [(0.02, 10), (0.02, 7)])  # larger than points are apart
 def test_the_noise_of_a_scanners_profiles_shows_beside_them_alone(noise_std: float, ratio: int) -> None:
     rough = profiles(noise_std, ratio, 20)
     patches = cut_patches(rough, coverage=3.0, seed=0)
     found = Sampling.of(rough, patches, 0.01)
     assert found.in_lines
     assert found.low_noise < 0.5
-    on_device = Sampling.of(rough, patches, 0.01, survey=partial(survey.survey_on, torch.device("cpu")))
-    assert on_device == replace(found, low_noise=pytest.approx(found.low_noise, abs=1e-6))
+    assert Sampling.of(rough, patches, 0.01, survey=partial(survey.survey_on, torch.device("cpu"))) == found
     walls = np.vstack([even_sphere(3000), 0.98 * even_sphere(3000)])
     for other in (profiles(0.0, ratio, 20), sphere(5000), noisy(even_sphere(5000), 0.002), walls):
         assert not Sampling.of(other, cut_patches(other, coverage=3.0, seed=0), 0.002).in_lines
@@ -60,7 +59,7 @@ def rms_off_the_ball(xyz: np.ndarray) -> float:
 
 
 def test_profiles_that_are_far_apart_are_told_by_points_of_others() -> None:
-    rough = profiles(0.003, 20, 16)
+    rough = profiles(0.003, 20, 26)
     assert Sampling.of(rough, cut_patches(rough, coverage=3.0, seed=0), 0.003).in_lines
     assert rms_off_the_ball(load_filter(threads=2).denoise(rough).xyz) < 0.9 * rms_off_the_ball(rough)
 

@@ -129,23 +129,23 @@ def test_spherical_scans_are_placed_and_normals_turn_with_their_pose(tmp_path: P
     assert list(cloud.attributes) == ["nx", "ny", "nz"]
 
 
-def test_what_not_all_scans_have_is_left_behind_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "a.e57"
+def bare_and_whole(path: Path) -> Path:
+    """Write a scan of 60 positions alone, and one of 50 points with all that they have."""
     with pye57.E57(str(path), mode="w") as file:
-        bare = {name: values for name, values in scanned(50, 1).items() if name.startswith("cartesian")}
+        bare = {name: values for name, values in scanned(60, 1).items() if name.startswith("cartesian")}
         file.write_scan_raw(bare, name="bare")
         file.write_scan_raw(scanned(50, 2), name="whole")
-    cloud, _ = read_cloud(path)
+    return path
+
+
+def test_what_not_all_scans_have_is_left_behind_by_name(tmp_path: Path) -> None:
+    cloud, _ = read_cloud(bare_and_whole(tmp_path / "a.e57"))
     assert list(cloud.attributes) == ["scan"]
     assert set(cloud.beside) == {"intensity", "colorRed", "colorGreen", "colorBlue", "rowIndex", "columnIndex"}
 
 
 def test_a_scan_of_no_points_takes_no_field_from_the_others(tmp_path: Path) -> None:
-    path = tmp_path / "a.e57"
-    with pye57.E57(str(path), mode="w") as file:
-        bare = {name: values for name, values in scanned(60, 1).items() if name.startswith("cartesian")}
-        file.write_scan_raw(bare, name="bare")
-        file.write_scan_raw(scanned(50, 2), name="whole")
+    path = bare_and_whole(tmp_path / "a.e57")
     _patched(path, b'recordCount="60"', b'recordCount="0"')
     cloud, _ = read_cloud(path)
     assert list(cloud.attributes) == ["intensity", "red", "green", "blue", "rowIndex", "columnIndex", "scan"]

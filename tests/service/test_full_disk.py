@@ -125,9 +125,9 @@ def test_every_job_is_deleted_on_a_disk_that_stays_full(tmp_path: Path) -> None:
         disk = Path(f"/proc/{server.process.pid}/root{data}")
         os.kill(server.worker_pid(), signal.SIGSTOP)
         with httpx2.Client(base_url=server.url, timeout=20) as http:
-            for number in range(5):
+            for number in range(10):
                 assert http.put(f"/jobs/{number}", content=b"0 0 0\n").status_code == 202
-            for number in reversed(range(5)):
+            for number in reversed(range(10)):
                 with filled(disk):
                     time.sleep(1)
                     assert http.delete(f"/jobs/{number}").status_code == 204, number
