@@ -195,12 +195,24 @@ def test_a_deadline_that_meets_a_slow_reader_is_no_fault_of_the_server(
 def test_a_fault_of_grpc_that_no_caller_made_is_one_of_the_server(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def many_writes_at_once(service: object, request: object, context: Any) -> None:
+    faults: list[Exception] = []
+
+    async def two_writes_at_once(service: object, request: object, context: Any) -> None:
         async with service._answering(context, "DownloadResult"):  # type: ignore[attr-defined]
             large = pb.DownloadResultResponse(chunk=bytes(1 << 20))
-            await asyncio.gather(*(context.write(large) for _ in range(9)))
+            while True:  # until a write waits for the caller, who does not read yet
+                waiting = asyncio.create_task(context.write(large))
+                if not (await asyncio.wait([waiting], timeout=0.5))[0]:
+                    break
+            try:
+                await context.write(large)
+            except grpc.aio.InternalError as fault:
+                faults.append(fault)
+                raise
+            finally:
+                await waiting
 
-    monkeypatch.setattr(grpc_calls.DenoiseService, "DownloadResult", many_writes_at_once)
+    monkeypatch.setattr(grpc_calls.DenoiseService, "DownloadResult", two_writes_at_once)
     monkeypatch.setattr(grpc_call, "_CANCELLED_WITHIN_SECONDS", 0.1)
 
     async def scenario() -> None:
@@ -208,8 +220,10 @@ def test_a_fault_of_grpc_that_no_caller_made_is_one_of_the_server(
             serving(tmp_path, willing(), grpc_port=(port := free_port())) as (_, host, _),
             grpc.aio.insecure_channel(f"{host}:{port}") as channel,
         ):
+            call: Any = DenoiseServiceStub(channel).DownloadResult(pb.DownloadResultRequest())
+            await until(lambda: faults)
             with pytest.raises(grpc.RpcError) as caught:
-                _ = [answer async for answer in DenoiseServiceStub(channel).DownloadResult(pb.DownloadResultRequest())]
+                _ = [answer async for answer in call]
             assert caught.value.code().name == "INTERNAL"
             assert "the server met an error of its own" in caught.value.details()
 
