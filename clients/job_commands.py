@@ -38,7 +38,7 @@ Id = Annotated[str, typer.Argument(metavar="ID", help="The job.")]
 Iterations = Annotated[str, typer.Option(metavar="auto|N", help="Passes of the filter.")]
 Seed = Annotated[str, typer.Option(metavar="INTEGER", help="The same seed gives the same bytes.")]
 Strength = Annotated[str, typer.Option(metavar="FLOAT", help="0..1, the share of the displacement to apply.")]
-Normals = Annotated[str, typer.Option(metavar="keep|recompute", help="Of a PLY or PCD file that has some.")]
+Normals = Annotated[str, typer.Option(metavar="keep|recompute", help="Of a PLY, PCD or E57 file that has some.")]
 Format = Annotated[str | None, typer.Option("--format", help="Of the result (ply, xyz, ...); else the input's.")]
 Name = Annotated[str | None, typer.Option("--name", help="What the input is called; text on stdin needs a suffix.")]
 

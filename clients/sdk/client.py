@@ -82,7 +82,7 @@ class Client:
         source: a path, the bytes of a file, an (N, 3) array, or an open3d cloud.
         name: of the file, where the source has none: bytes of text or KITTI are known by its suffix only.
         target: where to write the result, complete or not at all; by default it is held in memory.
-        normals: "recompute" them at the new positions, where a PLY or PCD file has some.
+        normals: "recompute" them at the new positions, where a PLY, PCD or E57 file has some.
         format: of the result; by default that of the target's name, else that of the source.
         timeout: seconds after which JobNotFinished is raised. on_progress: called with the share that is done, 0..1.
         Raises the StraightPCFError that the server met. Whatever ends this early ends the work on the server too.

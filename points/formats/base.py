@@ -31,7 +31,6 @@ class Format(ABC):
     media_type: ClassVar[str] = "application/octet-stream"
     writes_normals: ClassVar[bool] = False  # that were recomputed, in the place of the file's own
     has_magic: ClassVar[bool] = True  # False: only the file's suffix says what it is
-    is_written: ClassVar[bool] = True  # False: its files become others'
     types: ClassVar[Collection[str]] = ()  # of the numbers that a new file has columns for, such as "f4"
 
     def sniff(self, head: bytes) -> bool:

@@ -1,29 +1,24 @@
-"""E57: the scans of a terrestrial scanner, each in the place that its pose gives; it is read, and not written."""
+"""E57: the scans of a terrestrial scanner, each in the place that its pose gives."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.points.cloud import NORMALS, PointCloud
-from straightpcf.points.errors import MalformedFile, UnsupportedCloud
+from straightpcf.points.cloud import PointCloud
+from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count, check_unpacked
-from straightpcf.points.formats.colours import RGB
-from straightpcf.points.formats.e57_file import MAGIC, E57File, E57Points, child, number
+from straightpcf.points.formats.e57_file import MAGIC, E57File, E57Points, child, scans_of
+from straightpcf.points.formats.e57_new import TYPES, check_new, lost, new_e57
+from straightpcf.points.formats.e57_scan import CALLED, CARTESIAN, SPHERICAL, STATES, Columns, E57Scan
+from straightpcf.points.formats.e57_write import check_changeable, with_changes
+from straightpcf.points.formats.positions import changes, moved
 
 __all__ = ["E57"]
 
-_Columns = dict[str, npt.NDArray[Any]]
-_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
-_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_STATES = ("cartesianInvalidState", "sphericalInvalidState")  # 0: valid; 1: a direction alone; 2: nothing
-_NORMALS = ("normalX", "normalY", "normalZ")  # of the extension for surface normals
-# As other formats call what E57 has a name of its own for.
-_CALLED = dict(zip(("colorRed", "colorGreen", "colorBlue", *_NORMALS), (*RGB, *NORMALS[0]), strict=True))
 _SCAN = "scan"
 
 
@@ -36,7 +31,8 @@ class E57(Format):
     name = "e57"
     suffixes = (".e57",)
     media_type = "model/e57"
-    is_written = False
+    writes_normals = True
+    types = TYPES
 
     def sniff(self, head: bytes) -> bool:
         """Recognise the signature."""
@@ -50,84 +46,74 @@ class E57(Format):
         """Read every field that is a number; what not all scans have, and what is no number, is left behind."""
         raw = path.read_bytes()
         file = E57File(raw)
-        found = [scan for scan in child(file.root, "data3D") or () if child(scan, "points") is not None]
+        found = scans_of(file.root)
         if not found:
             raise UnsupportedCloud("the E57 file holds no scan of points")
         packed = [E57Points.of(scan) for scan in found]
         check_count(sum(points.count for points in packed), max_points, where="the E57 file")
         size = sum(points.count * points.row_bytes for points in packed)
         check_unpacked(size, len(raw), what="the E57 file's points")
-        scans = [_placed(points.read(file), scan) for points, scan in zip(packed, found, strict=True)]
-        columns = _together(scans)
-        axes = [columns.pop(axis) for axis in _CARTESIAN]
+        scans, read = [], []
+        for element, points in zip(found, packed, strict=True):
+            scan, columns = E57Scan.read(file, element, points)
+            scans.append(scan)
+            read.append(columns)
+        columns = _together(read)
+        xyz = np.stack([columns.pop(axis) for axis in CARTESIAN], axis=1)
         if len(scans) > 1:
-            counts = [len(scan[_CARTESIAN[0]]) for scan in scans]
-            columns[_SCAN] = np.repeat(np.arange(len(scans), dtype=np.uint32), counts)
-        attributes = {_CALLED.get(name, name): values for name, values in columns.items()}
-        return PointCloud(np.stack(axes, axis=1), attributes, beside=_beside(file, packed, columns))
+            columns[_SCAN] = np.repeat(np.arange(len(scans), dtype=np.uint32), [scan.size for scan in scans])
+        attributes = {CALLED.get(name, name): values for name, values in columns.items()}
+        source = E57Source(file, tuple(scans), xyz.copy())
+        return PointCloud(xyz, attributes, source, beside=_beside(file, packed, columns))
+
+    def left_behind(self, cloud: PointCloud) -> list[str]:
+        """Name what a new file has no place or another name for; nothing of a file that was one."""
+        return [] if isinstance(cloud.source, E57Source) else lost(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise UnsupportedCloud: of every cloud."""
-        raise UnsupportedCloud("E57 files are read, not written: take another format for the result, as PLY or LAS")
+        """Raise UnsupportedCloud where no file can be written."""
+        source = cloud.source
+        if isinstance(source, E57Source):
+            check_changeable(source.file, [scan.points for scan in source.scans])
+        else:
+            check_new(cloud)
 
     def write(self, cloud: PointCloud, path: Path) -> None:
-        """Raise as `check` does."""
-        self.check(cloud)
+        """Write the file that was read, what moved in its scan's own frame; or a new one."""
+        source = cloud.source
+        if not isinstance(source, E57Source):
+            path.write_bytes(new_e57(cloud))
+            return
+        _, new, old = changes(cloud, source.xyz, CARTESIAN)
+        changed = np.any(moved(new, old), axis=1)
+        ends = np.cumsum([scan.size for scan in source.scans]).tolist()
+        parts = [(scan, slice(end - scan.size, end)) for scan, end in zip(source.scans, ends, strict=True)]
+        made = [
+            scan.change(source.file, new[part], old[part], changed[part], has_normals=cloud.normals is not None)
+            for scan, part in parts
+            if changed[part].any()
+        ]
+        path.write_bytes(with_changes(source.file, made) if made else source.file.raw)
 
 
-def _placed(columns: _Columns, scan: ElementTree.Element) -> _Columns:
-    """Return a scan's columns, (M,) each, of what is a point, with places and normals in the file's frame."""
-    xyz, spherical = _popped(columns, _CARTESIAN), _popped(columns, _SPHERICAL)
-    valid = np.logical_and.reduce([columns.pop(name) == 0 for name in _STATES if name in columns])
-    if xyz is None and spherical is not None:
-        reach, turn, up = spherical.T
-        flat = reach * np.cos(up)
-        xyz = np.stack([flat * np.cos(turn), flat * np.sin(turn), reach * np.sin(up)], axis=1)
-    if xyz is None:
-        held = ", ".join(columns)[:200] or "nothing else"
-        raise UnsupportedCloud(f"a scan of the E57 file has no positions, cartesian or spherical, but {held}")
-    rotation, translation = _pose(scan)
-    columns |= zip(_CARTESIAN, (xyz @ rotation.T + translation).T, strict=True)
-    if all(name in columns for name in _NORMALS):
-        normals = np.stack([columns[name] for name in _NORMALS], axis=1)
-        columns |= zip(_NORMALS, (normals @ rotation.T).astype(normals.dtype).T, strict=True)
-    return columns if valid.all() else {name: values[valid] for name, values in columns.items()}
+@dataclass(frozen=True)
+class E57Source:
+    """Hold the file, its scans that have points, and the positions (N, 3) that were read of them."""
+
+    file: E57File
+    scans: tuple[E57Scan, ...]
+    xyz: npt.NDArray[np.float64]
 
 
-def _popped(columns: _Columns, names: tuple[str, ...]) -> npt.NDArray[np.float64] | None:
-    """Take three columns out, together (N, 3) float64; None where they are not all there."""
-    found = [columns.pop(name, None) for name in names]
-    there = [column.astype(np.float64) for column in found if column is not None]
-    return np.stack(there, axis=1) if len(there) == len(names) else None
-
-
-def _pose(scan: ElementTree.Element) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return a scan's rotation (3, 3), of a unit quaternion, and its translation (3,): p' = R p + t (E2807, 8.4.3)."""
-    pose = child(scan, "pose")
-    turned = np.array([number(pose, "rotation", axis, default=float(axis == "w")) for axis in "wxyz"])
-    moved = np.array([number(pose, "translation", axis) for axis in "xyz"])
-    length = np.linalg.norm(turned)
-    if not (0 < length < np.inf and np.isfinite(moved).all()):
-        raise MalformedFile(
-            f"a pose of the E57 file has the rotation {turned.tolist()} and the translation {moved.tolist()}"
-        )
-    w, x, y, z = (turned / length).tolist()
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]), moved  # fmt: skip
-
-
-def _together(scans: list[_Columns]) -> _Columns:
+def _together(scans: list[Columns]) -> Columns:
     """Return what all scans have that are of any points, scan after scan."""
-    filled = [scan for scan in scans if len(scan[_CARTESIAN[0]])] or scans
+    filled = [scan for scan in scans if len(scan[CARTESIAN[0]])] or scans
     common = [name for name in filled[0] if all(name in scan for scan in filled)]
     return {name: np.concatenate([scan[name] for scan in filled]) for name in common}
 
 
-def _beside(file: E57File, packed: list[E57Points], columns: _Columns) -> tuple[str, ...]:
+def _beside(file: E57File, packed: list[E57Points], columns: Columns) -> tuple[str, ...]:
     """Name what else the file holds: fields that are no numbers or that a scan lacks, and pictures."""
-    known = {*columns, *_CARTESIAN, *_SPHERICAL, *_STATES}
+    known = {*columns, *CARTESIAN, *SPHERICAL, *STATES}
     others = dict.fromkeys(field.name for points in packed for field in points.fields if field.name not in known)
     return (*others, *(["images2D"] if len(child(file.root, "images2D") or ()) else []))

@@ -13,19 +13,31 @@ import numpy.typing as npt
 
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import check_room
+from straightpcf.points.formats.e57_bits import bits_unpacked
+from straightpcf.points.formats.e57_pages import PAGE, PAYLOAD, checksums, unpaged
 
-__all__ = ["MAGIC", "E57Field", "E57File", "E57Points", "child", "number"]
+__all__ = [
+    "HEADER",
+    "MAGIC",
+    "PACKET",
+    "POINTS_PACKET",
+    "POINTS_SECTION",
+    "SECTION",
+    "E57Field",
+    "E57File",
+    "E57Points",
+    "child",
+    "number",
+    "scans_of",
+]
 
 MAGIC = b"ASTM-E57"
-_HEADER = struct.Struct("<8sIIQQQQ")  # magic, version, its minor one, length, where the XML is, its length, page's size
-_PAGE, _CHECKSUM = 1024, 4  # bytes of a page, with those of its checksum at its end
-_PAYLOAD = _PAGE - _CHECKSUM
-_SECTION = struct.Struct("<B7xQQQ")  # kind, length, where its packets begin, its index
-_POINTS_SECTION, _POINTS_PACKET = 1, 1
-_PACKET = struct.Struct("<BBH")  # kind, flags, length - 1
-_CRC32C = 0x82F63B78  # Castagnoli's polynomial, its bits reversed
-_PAGES_AT_ONCE, _VALUES_AT_ONCE = 1 << 14, 1 << 16
+HEADER = struct.Struct("<8sIIQQQQ")  # magic, version, its minor one, length, where the XML is, its length, page's size
+SECTION = struct.Struct("<B7xQQQ")  # kind, length, where its packets begin, its index
+PACKET = struct.Struct("<BBH")  # kind, flags, length - 1
+POINTS_SECTION, POINTS_PACKET = 1, 1
 _INT64 = np.iinfo(np.int64)
+_A_SECTION = "a section of points of the E57 file"
 
 
 @dataclass(frozen=True)
@@ -34,8 +46,10 @@ class E57Field:
 
     name: without the prefix of an extension; dtype: of the values, as `E57Points.read` returns them. Whole numbers
     (kind "Integer", "ScaledInteger") take as many bits as tell `minimum` from `maximum`, the lowest first.
+    element: of the prototype, which says it.
     """
 
+    element: ElementTree.Element
     name: str
     kind: str
     dtype: np.dtype[Any]
@@ -49,15 +63,20 @@ class E57Field:
         """How many bits of the stream a value takes, none where all are the same."""
         return 8 * self.dtype.itemsize if self.kind == "Float" else (self.maximum - self.minimum).bit_length()
 
+    @property
+    def is_number(self) -> bool:
+        """Whether it is one, and not text."""
+        return self.dtype.kind != "V"
+
     @classmethod
     def of(cls, element: ElementTree.Element) -> E57Field:
         """Read a child of a prototype; raises MalformedFile."""
         name, kind = _local(element.tag), element.get("type", "")
         if kind == "Float":
             is_single = element.get("precision") == "single"
-            return cls(name, kind, np.dtype(np.float32 if is_single else np.float64), 0, 0, 1.0, 0.0)
+            return cls(element, name, kind, np.dtype(np.float32 if is_single else np.float64), 0, 0, 1.0, 0.0)
         if kind not in ("Integer", "ScaledInteger"):
-            return cls(name, kind, np.dtype(np.void), 0, 0, 1.0, 0.0)
+            return cls(element, name, kind, np.dtype(np.void), 0, 0, 1.0, 0.0)
         try:
             minimum, maximum = int(element.get("minimum", _INT64.min)), int(element.get("maximum", _INT64.max))
             scale, offset = float(element.get("scale", 1)), float(element.get("offset", 0))
@@ -66,7 +85,8 @@ class E57Field:
         if not _INT64.min <= minimum <= maximum <= _INT64.max:
             raise MalformedFile(f"field {name[:40]} of the E57 file holds {minimum} to {maximum}")
         whole = np.min_scalar_type(maximum if minimum >= 0 else min(minimum, -1 - maximum))
-        return cls(name, kind, whole if kind == "Integer" else np.dtype(np.float64), minimum, maximum, scale, offset)
+        dtype = whole if kind == "Integer" else np.dtype(np.float64)
+        return cls(element, name, kind, dtype, minimum, maximum, scale, offset)
 
 
 @dataclass(frozen=True)
@@ -82,8 +102,8 @@ class E57Points:
         """Read what a scan says of its CompressedVector; raises MalformedFile, UnsupportedCloud."""
         element = child(scan, "points")
         prototype, codecs = child(element, "prototype"), child(element, "codecs")
-        if element is None or prototype is None:
-            raise MalformedFile("points of the E57 file have no prototype")
+        if element is None or element.get("type") != "CompressedVector" or prototype is None:
+            raise MalformedFile("points of the E57 file are no CompressedVector with a prototype")
         if codecs is not None and len(codecs):
             raise UnsupportedCloud("points of the E57 file are packed with a codec of their own; bitPackCodec is known")
         try:
@@ -101,31 +121,37 @@ class E57Points:
 
     def read(self, file: E57File) -> dict[str, npt.NDArray[Any]]:
         """Unpack all fields that are numbers: name -> (count,)."""
+        streams = zip(self.fields, self.streams(file), strict=True)
+        return {field.name: _decoded(stream, field, self.count) for field, stream in streams if field.is_number}
+
+    def streams(self, file: E57File) -> list[bytes]:
+        """Return each field's stream, as long at least as `count` values need; raises MalformedFile."""
         packets = file.packets(self) if any(self.count * field.bits for field in self.fields) else ()
         streams = [b"".join(parts) for parts in zip(*packets, strict=True)] or [b""] * len(self.fields)
-        values = {}
         for field, stream in zip(self.fields, streams, strict=True):
-            if field.dtype.kind == "V":  # text
-                continue
             where = f"field {field.name[:40]} of {self.count} points of the E57 file"
             check_room((self.count * field.bits + 7) // 8, len(stream), what=where)
-            values[field.name] = _decoded(stream, field, self.count)
-        return values
+        return streams
 
 
 class E57File:
-    """An E57 file in memory, of which every page has been compared with its checksum."""
+    """An E57 file in memory, of which every page has been compared with its checksum.
+
+    raw: its bytes; xml: what describes them, from `xml_begin` on, counted without checksums; root: the same, parsed.
+    """
 
     def __init__(self, raw: bytes) -> None:
         """Raises MalformedFile, UnsupportedCloud."""
-        check_room(_HEADER.size, len(raw), what="the header of an E57 file")
-        _, major, _, length, xml_offset, xml_length, page = _HEADER.unpack_from(raw)
-        if (major, page) != (1, _PAGE):
-            raise UnsupportedCloud(f"version {major} of E57 in pages of {page} bytes is not known; 1 in {_PAGE} is")
+        check_room(HEADER.size, len(raw), what="the header of an E57 file")
+        _, major, _, length, xml_offset, xml_length, page = HEADER.unpack_from(raw)
+        if (major, page) != (1, PAGE):
+            raise UnsupportedCloud(f"version {major} of E57 in pages of {page} bytes is not known; 1 in {PAGE} is")
         check_room(length, len(raw), what="the E57 file, says its header, which")
-        self._pages = np.frombuffer(raw, np.uint8, length // _PAGE * _PAGE).reshape(-1, _PAGE)
+        self.raw = raw
+        self._pages = np.frombuffer(raw, np.uint8, length // PAGE * PAGE).reshape(-1, PAGE)
         self._check()
-        xml = self.logical(_unpaged(xml_offset), xml_length, what="the XML of the E57 file")
+        self.xml_begin = unpaged(xml_offset)
+        self.xml = xml = self.logical(self.xml_begin, xml_length, what="the XML of the E57 file")
         if b"<!DOCTYPE" in xml:  # entities could make anything of it
             raise MalformedFile("the XML of the E57 file has a document type, which none has")
         try:
@@ -133,39 +159,46 @@ class E57File:
         except (ElementTree.ParseError, ValueError, LookupError) as exc:
             raise MalformedFile(f"the XML of the E57 file is broken: {exc}") from exc
 
+    @property
+    def content(self) -> bytearray:
+        """All of the file without its checksums."""
+        return bytearray(self._pages[:, :PAYLOAD].tobytes())
+
     def logical(self, begin: int, length: int, *, what: str) -> bytes:
         """Return `length` bytes from `begin` on, both counted without checksums."""
-        check_room(begin + length, self._pages.shape[0] * _PAYLOAD, what=what)
-        first, last = begin // _PAYLOAD, -(-(begin + length) // _PAYLOAD)
-        begin -= first * _PAYLOAD
-        return self._pages[first:last, :_PAYLOAD].tobytes()[begin : begin + length]
+        check_room(begin + length, self._pages.shape[0] * PAYLOAD, what=what)
+        first, last = begin // PAYLOAD, -(-(begin + length) // PAYLOAD)
+        begin -= first * PAYLOAD
+        return self._pages[first:last, :PAYLOAD].tobytes()[begin : begin + length]
+
+    def section(self, file_offset: int) -> tuple[int, int, int]:
+        """Return where a section of points begins and ends and its packets begin; raises MalformedFile."""
+        begin = unpaged(file_offset)
+        kind, length, data, _ = SECTION.unpack(self.logical(begin, SECTION.size, what=_A_SECTION))
+        first, end = unpaged(data), begin + length
+        if kind != POINTS_SECTION or not begin + SECTION.size <= first <= end:
+            raise MalformedFile(f"byte {file_offset} of the E57 file begins no section of points")
+        check_room(end, self._pages.shape[0] * PAYLOAD, what=_A_SECTION)
+        return begin, end, first
 
     def packets(self, points: E57Points) -> Iterator[list[memoryview]]:
         """Yield, packet by packet, a part of each field's stream."""
-        what, begin = "a section of points of the E57 file", _unpaged(points.file_offset)
-        kind, length, data, _ = _SECTION.unpack(self.logical(begin, _SECTION.size, what=what))
-        if kind != _POINTS_SECTION or not begin < (first := _unpaged(data)) <= begin + length:
-            raise MalformedFile(f"byte {points.file_offset} of the E57 file begins no section of points")
-        section = memoryview(self.logical(first, begin + length - first, what=what))
+        _, end, first = self.section(points.file_offset)
+        section = memoryview(self.logical(first, end - first, what=_A_SECTION))
         at = 0
-        while at + _PACKET.size <= len(section):
-            kind, _, less = _PACKET.unpack_from(section, at)
+        while at + PACKET.size <= len(section):
+            kind, _, less = PACKET.unpack_from(section, at)
             packet, at = section[at : at + less + 1], at + less + 1
             check_room(less + 1, len(packet), what="a packet of points of the E57 file")
-            if kind == _POINTS_PACKET:
+            if kind == POINTS_PACKET:
                 yield _streams(packet, len(points.fields))
 
     def _check(self) -> None:
         """Raise MalformedFile where a page is not what its checksum is of."""
-        table = _crc_table()
-        for begin in range(0, len(self._pages), _PAGES_AT_ONCE):
-            pages = self._pages[begin : begin + _PAGES_AT_ONCE]
-            crc = np.full(len(pages), 0xFFFFFFFF, np.uint32)
-            for pair in np.ascontiguousarray(pages[:, :_PAYLOAD]).view("<u2").T:
-                crc = (crc >> 16) ^ table[(crc ^ pair) & 0xFFFF]
-            wrong = np.flatnonzero(~crc != np.ascontiguousarray(pages[:, _PAYLOAD:]).view(">u4")[:, 0])
-            if len(wrong):
-                raise MalformedFile(f"page {begin + wrong[0]} of the E57 file is damaged: its checksum differs")
+        said = np.ascontiguousarray(self._pages[:, PAYLOAD:]).view(">u4")[:, 0]
+        wrong = np.flatnonzero(checksums(self._pages) != said)
+        if len(wrong):
+            raise MalformedFile(f"page {wrong[0]} of the E57 file is damaged: its checksum differs")
 
 
 def child(element: ElementTree.Element | None, *path: str) -> ElementTree.Element | None:
@@ -186,6 +219,11 @@ def number(element: ElementTree.Element | None, *path: str, default: float = 0.0
         raise MalformedFile(f"{path[-1]} of the E57 file is {found.text!r:.40}") from exc
 
 
+def scans_of(root: ElementTree.Element) -> list[ElementTree.Element]:
+    """Return the scans of an E57 file that have points."""
+    return [scan for scan in child(root, "data3D") or () if child(scan, "points") is not None]
+
+
 def _leaves(prototype: ElementTree.Element) -> Iterator[ElementTree.Element]:
     for element in prototype:
         if element.get("type") in ("Structure", "Vector"):
@@ -198,17 +236,11 @@ def _local(tag: str) -> str:
     return tag.rpartition("}")[2]
 
 
-def _unpaged(offset: int) -> int:
-    """Turn a place in the file into one without checksums."""
-    page, within = divmod(offset, _PAGE)
-    return page * _PAYLOAD + min(within, _PAYLOAD)
-
-
 def _streams(packet: memoryview, fields: int) -> list[memoryview]:
     """Cut a packet into its parts of the fields' streams."""
-    what, begin = "a packet of points of the E57 file", _PACKET.size + 2 * (fields + 1)
+    what, begin = "a packet of points of the E57 file", PACKET.size + 2 * (fields + 1)
     check_room(begin, len(packet), what=what)
-    count, *lengths = struct.unpack_from(f"<{fields + 1}H", packet, _PACKET.size)
+    count, *lengths = struct.unpack_from(f"<{fields + 1}H", packet, PACKET.size)
     if count != fields:
         raise MalformedFile(f"{what} has {count} streams for {fields} fields")
     check_room(begin + sum(lengths), len(packet), what=what)
@@ -220,27 +252,8 @@ def _decoded(stream: bytes, field: E57Field, count: int) -> npt.NDArray[Any]:
     """Unpack the values (count,) of a field."""
     if field.kind == "Float":
         return np.frombuffer(stream, field.dtype.newbyteorder("<"), count).astype(field.dtype)
-    whole, bits = np.empty(count, np.int64), field.bits
-    packed = np.frombuffer(stream, np.uint8)
-    for begin in range(0, count, _VALUES_AT_ONCE):  # a multiple of 8: every part begins with a byte
-        some = whole[begin : begin + _VALUES_AT_ONCE]
-        if bits:
-            here = packed[begin * bits // 8 :][: (len(some) * bits + 7) // 8]
-            each = np.unpackbits(here, bitorder="little", count=len(some) * bits).reshape(len(some), bits)
-            wide = np.zeros((len(some), 64), np.uint8)
-            wide[:, :bits] = each
-            some[:] = np.packbits(wide, axis=1, bitorder="little").view("<i8")[:, 0]
-        else:
-            some[:] = 0
+    whole = bits_unpacked(stream, field.bits, count)
     whole += field.minimum  # of 64 bits it wraps around, as it should
     if field.kind == "Integer":
         return whole.astype(field.dtype)
     return whole * field.scale + field.offset
-
-
-def _crc_table() -> npt.NDArray[np.uint32]:
-    """Return what two bytes make of a checksum, the lower one first: (65536,)."""
-    table: npt.NDArray[np.uint32] = np.arange(1 << 16, dtype=np.uint32)
-    for _ in range(16):
-        table = (table >> np.uint32(1)) ^ np.where(table & 1, np.uint32(_CRC32C), np.uint32(0))
-    return table

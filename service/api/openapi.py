@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _SHA256 = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-_FORMAT_NAMES = [format.name for format in FORMATS if format.is_written]
+_FORMAT_NAMES = [format.name for format in FORMATS]
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "iterations": {
@@ -58,7 +58,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "maximum": 1,
     },
     "normals": {
-        "description": "Keep the file's normals, or recompute them at the new positions (PLY and PCD).",
+        "description": "Keep the file's normals, or recompute them at the new positions (PLY, PCD, E57).",
         "type": "string",
         "default": "keep",
         "enum": ["keep", "recompute"],
@@ -190,7 +190,7 @@ _OF_PROBLEM = {401: ("WWW-Authenticate",), 416: ("Content-Range",)} | {
     status: ("Retry-After",) for status in (408, 429, 503, 507)
 }
 _TEXT: dict[str, Any] = {"schema": {"type": "string"}}
-_FILE_CONTENT = {format.media_type: _RAW for format in FORMATS if format.is_written}
+_FILE_CONTENT = {format.media_type: _RAW for format in FORMATS}
 
 
 def _headers(*names: str) -> dict[str, Any]:

@@ -236,12 +236,11 @@ class Health(BaseModel):
 
 
 class FormatInfo(BaseModel):
-    """Describe one file format; written: whether a result can be of it."""
+    """Describe one file format."""
 
     name: str
     suffixes: list[str]
     media_type: str
-    written: bool
 
 
 class Info(BaseModel):
@@ -272,12 +271,7 @@ class Info(BaseModel):
             max_iterations=MAX_ITERATIONS,
             **{name: getattr(engine.limits, name) for name in names},
             formats=[
-                FormatInfo(
-                    name=format.name,
-                    suffixes=list(format.suffixes),
-                    media_type=format.media_type,
-                    written=format.is_written,
-                )
+                FormatInfo(name=format.name, suffixes=list(format.suffixes), media_type=format.media_type)
                 for format in FORMATS
             ],
         )

@@ -14,10 +14,9 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.formats import FORMATS, Format
 from tests.clouds import torus
 
-__all__ = ["SAMPLES", "WRITTEN_FORMATS", "npy", "npz", "plain_cloud"]
+__all__ = ["SAMPLES", "npy", "npz", "plain_cloud"]
 
 N = 60
-WRITTEN_FORMATS = [format for format in FORMATS if format.is_written]
 
 
 def plain_cloud(count: int = N) -> PointCloud:
@@ -114,5 +113,5 @@ def _stored(name: str, content: Callable[[], bytes]) -> Callable[[Path], Path]:
 
 SAMPLES: dict[str, Callable[[Path], Path]] = {
     **{title: _stored(name, content) for title, (name, content) in _FILES.items()},
-    **{f"{format.name} of ours": _written(format) for format in WRITTEN_FORMATS},
+    **{f"{format.name} of ours": _written(format) for format in FORMATS},
 }

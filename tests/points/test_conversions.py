@@ -15,7 +15,7 @@ from straightpcf.points.errors import MissingDependency, UnsupportedCloud
 from straightpcf.points.formats import FORMATS, Format, format_named, read_cloud, write_cloud
 from straightpcf.points.formats.scalars import scalar_columns
 from tests.effort import at_most_lines
-from tests.points.samples import SAMPLES, WRITTEN_FORMATS, torus
+from tests.points.samples import SAMPLES, torus
 
 LARGE = np.array([1700000000123456789, 4611686018427387905, -9007199254740993])
 
@@ -36,7 +36,7 @@ def columns(cloud: PointCloud, name: str) -> npt.NDArray[np.generic]:
     return np.column_stack(extra or plain)
 
 
-@pytest.mark.parametrize("target", WRITTEN_FORMATS, ids=lambda format: format.name)
+@pytest.mark.parametrize("target", FORMATS, ids=lambda format: format.name)
 @pytest.mark.parametrize("sample", SAMPLES)
 def test_every_attribute_arrives_or_is_named(sample: str, target: Format, tmp_path: Path) -> None:
     try:

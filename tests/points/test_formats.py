@@ -15,13 +15,12 @@ import pytest
 from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, MissingDependency, TooManyPoints, UnknownFormat, UnsupportedCloud
 from straightpcf.points.formats import FORMATS, Format, format_for, format_named, read_cloud, write_cloud
-from tests.points.samples import SAMPLES, WRITTEN_FORMATS, N, plain_cloud
+from tests.points.samples import SAMPLES, N, plain_cloud
 
 SCANS = Path(__file__).parents[2].parent / "shared" / "data" / "scans"
 TOLERANCE = {"las": 1e-3, "laz": 1e-3, "kitti": 1e-6, "pcd": 1e-6}
 _PTX = b"60\r\n1\r\n1 2 3\r\n1 0 0\r\n0 1 0\r\n0 0 1\r\n1 0 0 0\r\n0 1 0 0\r\n0 0 1 0\r\n1 2 3 1\r\n0.5 -1 2 0.25\r\n"
 every_format = pytest.mark.parametrize("format", FORMATS, ids=lambda format: format.name)
-every_written_format = pytest.mark.parametrize("format", WRITTEN_FORMATS, ids=lambda format: format.name)
 
 
 @pytest.fixture(params=SAMPLES)
@@ -96,7 +95,7 @@ def test_a_file_is_known_by_its_content_or_by_the_name_it_was_given(sample: Path
     assert len(read_cloud(nameless, name=sample.name)[0]) == N
 
 
-@every_written_format
+@every_format
 def test_a_cloud_of_another_format_is_written_whole(format: Format, tmp_path: Path) -> None:
     cloud = plain_cloud()
     path = tmp_path / f"new{format.suffixes[0]}"

@@ -351,11 +351,11 @@ def test_normals_are_recomputed_where_a_file_has_some(server: RunningServer, tmp
         assert curl("--data-binary", "@-", bad, stdin=body).problem()["status"] == 422
     assert curl("--data-binary", "@-", query, stdin=npy(xyz)).problem()["code"] == "unsupported_cloud"
     np.savez(packed := io.BytesIO(), points=xyz, normals=xyz.astype(np.float32))
-    for format, status in {"ply": 200, "pcd": 200, "npz": 422}.items():
+    for format, status in {"ply": 200, "pcd": 200, "e57": 200, "npz": 422}.items():
         answer = curl("--data-binary", "@-", f"{query}&format={format}", stdin=packed.getvalue())
         assert answer.status == status
         if status == 422:
-            assert answer.problem()["detail"] == "normals=recompute is for ply, pcd; the result would be npz"
+            assert answer.problem()["detail"] == "normals=recompute is for ply, pcd, e57; the result would be npz"
             continue
         (path := tmp_path / f"a.{format}").write_bytes(answer.body)
         np.testing.assert_allclose(np.linalg.norm(read_cloud(path)[0].old_normals(), axis=1), 1.0, atol=1e-5)

@@ -51,8 +51,7 @@ export class Form {
     parts.file.accept = suffixes.join(",");
     parts.server.textContent = [`version ${info.version}`, info.devices.join(", ")].filter(Boolean).join(" · ");
     fill(parts.iterations, Array.from({ length: info.max_iterations }, (_, pass) => [String(pass + 1), String(pass + 1)]));
-    const written = info.formats.filter((format) => format.written);
-    fill(parts.format, written.map((format) => [format.name, format.name.toUpperCase()]));
+    fill(parts.format, info.formats.map((format) => [format.name, format.name.toUpperCase()]));
   }
 
   // What is wrong before anything is sent, and in which part; or null.
