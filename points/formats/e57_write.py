@@ -53,7 +53,7 @@ class ChangedPoints:
 def check_changeable(file: E57File, scans: Sequence[E57Points]) -> None:
     """Raise MalformedFile or UnsupportedCloud where `with_changes` would, wherever points move."""
     sections = sorted(file.section(points.file_offset)[:2] for points in scans if points.count)
-    if any(begin < end for (_, end), (begin, _) in itertools.pairwise(sections)):
+    if any(begin < end + -end % _ALIGNED for (_, end), (begin, _) in itertools.pairwise(sections)):
         raise UnsupportedCloud("two scans of the E57 file share their points: take another format, as PLY or LAS")
     for element, place in _placed_elsewhere(file.root):
         if element.get("type") == "CompressedVector":
