@@ -116,4 +116,5 @@ def _beside(file: E57File, packed: list[E57Points], columns: Columns) -> tuple[s
     """Name what else the file holds: fields that are no numbers or that a scan lacks, and pictures."""
     known = {*columns, *CARTESIAN, *SPHERICAL, *STATES}
     others = dict.fromkeys(field.name for points in packed for field in points.fields if field.name not in known)
-    return (*others, *(["images2D"] if len(child(file.root, "images2D") or ()) else []))
+    pictures = child(file.root, "images2D")
+    return (*others, *(["images2D"] if pictures is not None and len(pictures) else []))

@@ -221,7 +221,8 @@ def number(element: ElementTree.Element | None, *path: str, default: float = 0.0
 
 def scans_of(root: ElementTree.Element) -> list[ElementTree.Element]:
     """Return the scans of an E57 file that have points."""
-    return [scan for scan in child(root, "data3D") or () if child(scan, "points") is not None]
+    scans = child(root, "data3D")
+    return [scan for scan in (() if scans is None else scans) if child(scan, "points") is not None]
 
 
 def _leaves(prototype: ElementTree.Element) -> Iterator[ElementTree.Element]:
