@@ -26,6 +26,7 @@ from straightpcf.points.formats.npy import Npy
 from straightpcf.points.formats.npz import Npz
 from straightpcf.points.formats.pcd import Pcd
 from straightpcf.points.formats.ply import Ply
+from straightpcf.points.formats.ptx import Ptx
 from straightpcf.points.formats.xyz import Csv, Pts, Tsv, Xyz
 
 __all__ = [
@@ -42,7 +43,21 @@ __all__ = [
     "write_cloud",
 ]
 
-FORMATS: tuple[Format, ...] = (Ply(), Pcd(), Las(), Laz(), E57(), Npy(), Npz(), Xyz(), Csv(), Tsv(), Pts(), Kitti())
+FORMATS: tuple[Format, ...] = (
+    Ply(),
+    Pcd(),
+    Las(),
+    Laz(),
+    E57(),
+    Npy(),
+    Npz(),
+    Xyz(),
+    Csv(),
+    Tsv(),
+    Pts(),
+    Ptx(),
+    Kitti(),
+)
 
 # Endings of files that would pass for another format's, and be scrambled.
 _NOT_OURS = {
@@ -50,18 +65,10 @@ _NOT_OURS = {
     "as (N, 5) float32 in a .npy file it can be taken"
 }
 
-# The first ten lines of a PTX file: columns, rows, four of the scanner's pose, four of a matrix.
-_WHOLE = rb"[ \t]*\d+[ \t]*\r?\n"
-_THREE, _FOUR = (rb"[ \t]*" + rb"[ \t]+".join([rb"[-+.\deE]+"] * count) + rb"[ \t]*\r?\n" for count in (3, 4))
-
 # How files of other programs begin, whatever they are called, and what to do about them.
 _FOREIGN = (
     # CloudCompare saves it by default, under the suffix of KITTI's frames: CCB2 and the like.
     (re.compile(rb"CCB[0-?]"), "a BIN file of CloudCompare's own: save it as PLY or LAS there"),
-    (
-        re.compile(_WHOLE * 2 + _THREE * 4 + _FOUR * 4),
-        "a PTX file, whose scans have a pose each: save it as PTS, PLY or LAS, with CloudCompare or its own program",
-    ),
     (re.compile(rb"ncols\s+\d", re.IGNORECASE), "an ESRI grid of heights: turn it into x y z, as GDAL does (XYZ)"),
 )
 

@@ -14,9 +14,9 @@ import numpy.typing as npt
 from straightpcf.points.cloud import NORMALS, PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
-from straightpcf.points.formats.colours import RGB, are_shares, in_8_bits, unpacked
+from straightpcf.points.formats.colours import RGB, are_shares, unpacked
 from straightpcf.points.formats.positions import AXES
-from straightpcf.points.formats.scalars import check_columns, scalar_columns, with_intensity
+from straightpcf.points.formats.scalars import check_columns, scalar_columns
 from straightpcf.points.formats.text import (
     Lines,
     as_integers,
@@ -26,8 +26,15 @@ from straightpcf.points.formats.text import (
     replaced,
     shown,
 )
+from straightpcf.points.formats.text_new import (
+    TEXT_TYPES,
+    axis_columns,
+    intensity_and_colour,
+    lost_of_colour,
+    table_lines,
+)
 from straightpcf.points.formats.titles import MARKS, MAX_COLUMNS
-from straightpcf.points.formats.xyz_layout import NO_COMMA, PTS_COLUMNS, Layout, read_layout
+from straightpcf.points.formats.xyz_layout import NO_COMMA, Layout, read_layout
 
 __all__ = ["Csv", "Pts", "Tsv", "Xyz"]
 
@@ -38,7 +45,6 @@ _UNIT_ERROR = 1e-2  # of a normal's length, by the digits of a text
 _LOOKED_AT = 1 << 14  # bytes of the first rows, which tell decimal commas from cells
 # Three numbers or more, each of two cells between commas: 0,5, 1,5, 2,5.
 _PAIRS = re.compile(rb"\s*[+-]?\d+,\d+(?:,\s*[+-]?\d+,\d+){2,}\s*")
-_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 _WHOLE, _UNSIGNED = np.dtype(np.int64), np.dtype(np.uint64)
 _Offsets = npt.NDArray[np.int64]
 
@@ -75,7 +81,7 @@ class Xyz(Format):
     has_magic = False
     delimiter: ClassVar[bytes | None] = None  # of a new file; None for a space
     marks: ClassVar[tuple[bytes, ...]] = MARKS  # that may be between cells
-    types = _TYPES
+    types = TEXT_TYPES
     is_counted: ClassVar[bool] = False  # a new file begins with the number of points
 
     def read(self, path: Path, *, max_points: int) -> PointCloud:
@@ -119,10 +125,10 @@ class Xyz(Format):
 
     def _new_file(self, cloud: PointCloud) -> bytes:
         """Lay out x, y, z and every numeric attribute; their names stand above if there are any."""
-        columns = _axes(cloud) | scalar_columns(unpacked(cloud.in_columns()), _TYPES, taken=AXES)
+        columns = axis_columns(cloud) | scalar_columns(unpacked(cloud.in_columns()), TEXT_TYPES, taken=AXES)
         separator = " " if self.delimiter is None else self.delimiter.decode()
         names = ("# " if self.delimiter is None else "") + separator.join(columns)
-        return _lines([names] if len(columns) > 3 else [], columns, separator)
+        return table_lines([names] if len(columns) > 3 else [], columns, separator)
 
     def _own(self, cloud: PointCloud) -> XyzSource | None:
         """Return the file that was read, where it is written again."""
@@ -168,16 +174,11 @@ class Pts(Xyz):
         source = cloud.source
         if isinstance(source, XyzSource) and self._has_layout(source.layout):
             return []
-        held = in_8_bits(with_intensity(cloud.attributes))
-        columns = _pts_columns(held)
-        there = [name for name in columns if name in held]
-        other = [name for name in there if not np.array_equal(held[name], columns[name], equal_nan=True)]
-        rounded = (f"{name} (rounded to uint8)" if name in RGB else name for name in other)
-        return [*cloud.beside, *(name for name in held if name not in columns), *rounded]
+        return lost_of_colour(cloud)
 
     def _new_file(self, cloud: PointCloud) -> bytes:
         """Lay out what the format has columns for; with a colour, intensity is there."""
-        return _lines([str(len(cloud))], _axes(cloud) | _pts_columns(in_8_bits(with_intensity(cloud.attributes))), " ")
+        return table_lines([str(len(cloud))], axis_columns(cloud) | intensity_and_colour(cloud), " ")
 
 
 def _table(
@@ -371,29 +372,3 @@ def _check_columns(table: Lines, numbers: npt.NDArray[np.int64], columns: int) -
     if wrong.any():
         row = int(np.argmax(wrong))
         raise MalformedFile(f"line {numbers[row]} has {table.counts[row]} columns, the lines before have {columns}")
-
-
-def _axes(cloud: PointCloud) -> dict[str, npt.NDArray[Any]]:
-    return {axis: cloud.xyz[:, index] for index, axis in enumerate(AXES)}
-
-
-def _pts_columns(attributes: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Return what a .pts file has of attributes, their colour in 8 bits where it can be: see PTS_COLUMNS."""
-    columns = scalar_columns({n: attributes[n] for n in PTS_COLUMNS[7] if n in attributes}, _TYPES, taken=AXES)
-    if not all(name in columns and columns[name].dtype.str[1:] in ("u1", "u2") for name in RGB):
-        return {name: columns[name] for name in ("intensity",) if name in columns}
-    intensity = columns.get("intensity", np.zeros(len(columns["red"]), np.uint8))
-    rgb = {name: columns[name] >> 8 if columns[name].itemsize > 1 else columns[name] for name in RGB}
-    return {"intensity": intensity, **rgb}
-
-
-def _lines(above: list[str], columns: dict[str, npt.NDArray[Any]], separator: str) -> bytes:
-    rows = map(separator.join, zip(*(_texts(values) for values in columns.values()), strict=True))
-    lines = [*above, *rows]
-    return "\n".join([*lines, ""]).encode() if lines else b""
-
-
-def _texts(values: npt.NDArray[Any]) -> list[str]:
-    """Write (N,) numbers as the shortest texts that read back as the same numbers of their type."""
-    texts = values.astype(str).tolist() if values.dtype == np.float32 else map(repr, values.tolist())
-    return [text.removesuffix(".0") for text in texts]  # a label stays a whole number

@@ -74,6 +74,14 @@ def _text(separator: str, *above: str, end: str = "\n") -> bytes:
     return end.join([*above, *rows[:20], "", *rows[20:], ""]).encode()
 
 
+def _ptx() -> bytes:
+    """Two scans, the first of a colour; the scanner did not move."""
+    pose = ["1 2 3", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
+    rows = [f"{x:.6f} {y:.6f} {z:.6f} {i / N:.4f}" for i, (x, y, z) in enumerate(torus(N))]
+    first = [f"{row} {i} 2 255" for i, row in enumerate(rows[:20])]
+    return "\r\n".join(["4", "5", *pose, *first, "1", "40", *pose, *rows[20:], ""]).encode()
+
+
 _FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "ply ascii": ("a.ply", _ply_ascii),
     "ply little": ("a.ply", lambda: _ply_binary("<")),
@@ -86,6 +94,7 @@ _FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "tsv without tabs": ("a.tsv", lambda: _text(" ")),
     "xyz semicolons": ("a.asc", lambda: _text("; ")),
     "xyz pts": ("a.pts", lambda: _text(" ", str(N))),
+    "ptx": ("a.ptx", _ptx),
     "npy float32": ("a.npy", lambda: npy(torus(N).astype("<f4"))),
     "npy fortran": ("a.npy", lambda: npy(np.asfortranarray(np.tile(torus(N), 2).astype(">f8")))),
     "npy float16": ("a.npy", lambda: npy(torus(N).astype("<f2"))),

@@ -19,7 +19,6 @@ from tests.points.samples import SAMPLES, N, plain_cloud
 
 SCANS = Path(__file__).parents[2].parent / "shared" / "data" / "scans"
 TOLERANCE = {"las": 1e-3, "laz": 1e-3, "kitti": 1e-6, "pcd": 1e-6}
-_PTX = b"60\r\n1\r\n1 2 3\r\n1 0 0\r\n0 1 0\r\n0 0 1\r\n1 0 0 0\r\n0 1 0 0\r\n0 0 1 0\r\n1 2 3 1\r\n0.5 -1 2 0.25\r\n"
 every_format = pytest.mark.parametrize("format", FORMATS, ids=lambda format: format.name)
 
 
@@ -106,9 +105,9 @@ def test_a_cloud_of_another_format_is_written_whole(format: Format, tmp_path: Pa
     again, found = read_cloud(path)
     assert found is format
     np.testing.assert_allclose(again.xyz, cloud.xyz, atol=TOLERANCE.get(format.name, 0))
-    if format.name in ("ply", "pcd", "npz", "xyz", "csv", "tsv", "pts"):
+    if format.name in ("ply", "pcd", "npz", "xyz", "csv", "tsv", "pts", "ptx", "e57"):
         lost = format.left_behind(cloud)
-        assert lost == (["label"] if format.name == "pts" else [])
+        assert lost == (["label"] if format.name in ("pts", "ptx") else [])
         for name, values in cloud.attributes.items():
             if name in lost:
                 continue
@@ -190,10 +189,6 @@ def test_a_bin_file_of_cloudcompares_is_called_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "begins", "message"),
     [
-        *(
-            (name, _PTX, "is a PTX file, whose scans have a pose each: save it as")
-            for name in ("a.ptx", "a.txt", "a.pts")
-        ),
         ("dem.asc", b"ncols         4\nnrows         6\n", "is an ESRI grid of heights: turn it into x y z"),
     ],
 )
