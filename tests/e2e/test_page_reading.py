@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from straightpcf.points.formats import format_named, read_cloud
+from tests.points.samples import SAMPLES
 from tests.points.test_xyz import TABBED, TABLES
 from tests.points.test_xyz_refused import GRIDS, MALFORMED, scanned
 
@@ -35,6 +36,14 @@ def test_the_page_splits_a_tsv_at_its_tabs_as_the_server_does(page: Any) -> None
         assert page.evaluate(POSITIONS, [list(raw), "a.tsv"]) == [1, 2, 3, 4, 5, 6], case
     gaps = page.evaluate(POSITIONS, [list(b"x\ty\tz\n1\t2\t3\n\t\t\n4\t\t6\n"), "a.tsv"])
     np.testing.assert_array_equal(np.array(gaps, np.float64), [1, 2, 3, np.nan, np.nan, np.nan, 4, np.nan, 6])
+
+
+def test_the_page_leaves_a_ptx_file_to_the_server_whatever_it_is_called(page: Any, tmp_path: Path) -> None:
+    said = "async (a) => { try { return (await (%s)(a)).length } catch (error) { return error.message } }" % POSITIONS  # noqa: UP031
+    raw = SAMPLES["ptx"](tmp_path).read_bytes()
+    for name in ("a.ptx", "a.txt", "a.pts"):
+        assert page.evaluate(said, [list(raw), name]) == "a format that this page does not read", name
+    assert page.evaluate(said, [list(raw.partition(b"0 0 0 1\r\n")[2].partition(b"\r\n1\r\n")[0]), "a.txt"]) == 60
 
 
 def test_the_page_reads_a_ply_with_capital_axes(page: Any, scan: Path, tmp_path: Path) -> None:

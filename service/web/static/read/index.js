@@ -6,6 +6,11 @@ import { MARKS, readXyz } from "./xyz.js";
 
 const TEXT = [".xyz", ".txt", ".asc", ".xyzn", ".xyzrgb", ".csv", ".tsv", ".pts"];
 
+// The ten lines above a scan of a PTX file, by points/formats/ptx.py; its matrix places the points.
+const NUMBERS = (count) => String.raw`[ \t]*[-+.\deE]+(?:[ \t]+[-+.\deE]+){${count - 1}}[ \t]*\r?\n`;
+const PTX = new RegExp(String.raw`^(?:[ \t]*\d+[ \t]*\r?\n){2}(?:${NUMBERS(3)}){4}(?:${NUMBERS(4)}){4}`);
+const HEAD_BYTES = 4096;
+
 export const READABLE = [".ply", ".npy", ...TEXT];
 export const MAX_READ_BYTES = 1 << 30;
 export const MAX_SHOWN = 2_000_000;
@@ -20,7 +25,8 @@ export function readPositions(bytes, name) {
   const hasMark = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf; // of byte order
   const bare = hasMark ? bytes.subarray(3) : bytes;
   if (bare[0] === 0x70 && bare[1] === 0x6c && bare[2] === 0x79 && bare[3] <= 32) return readPly(bare);
-  if (TEXT.includes(suffixOf(name))) return readXyz(bytes, suffixOf(name) === ".tsv" ? ["\t", ...MARKS] : MARKS);
+  const isPtx = PTX.test(new TextDecoder("latin1").decode(bytes.subarray(0, HEAD_BYTES)));
+  if (TEXT.includes(suffixOf(name)) && !isPtx) return readXyz(bytes, suffixOf(name) === ".tsv" ? ["\t", ...MARKS] : MARKS);
   throw new Error("a format that this page does not read");
 }
 
