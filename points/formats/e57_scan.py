@@ -132,7 +132,8 @@ def _placed(columns: Columns, scan: ElementTree.Element) -> tuple[Columns, npt.N
         held = ", ".join(columns)[:200] or "nothing else"
         raise UnsupportedCloud(f"a scan of the E57 file has no positions, cartesian or spherical, but {held}")
     rotation, translation = _pose(scan)
-    columns |= zip(CARTESIAN, (xyz @ rotation.T + translation).T, strict=True)
+    with np.errstate(over="ignore", invalid="ignore"):  # of one that is infinite little is left
+        columns |= zip(CARTESIAN, (xyz @ rotation.T + translation).T, strict=True)
     if all(name in columns for name in NORMAL):
         normals = np.stack([columns[name] for name in NORMAL], axis=1)
         columns |= zip(NORMAL, (normals @ rotation.T).astype(normals.dtype).T, strict=True)

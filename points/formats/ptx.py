@@ -28,7 +28,7 @@ _COUNT = rb"[ \t]*\d+[ \t]*\r?\n"
 _THREE, _FOUR = (rb"[ \t]*" + rb"[ \t]+".join([rb"[-+.\deE]+"] * count) + rb"[ \t]*\r?\n" for count in (3, 4))
 _BEGINNING = re.compile(_COUNT * 2 + _THREE * 4 + _FOUR * 4)
 _COLUMNS = {3: (), **PTS_COLUMNS}  # behind x y z
-_LONGEST_LINE = 1 << 16
+_LONGEST_LINE, _COUNT_DIGITS = 1 << 16, 10
 _SCAN = "scan"
 _NO_INTENSITY = 0.5  # what programs write there
 _NEW = ("0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1")  # no pose
@@ -134,8 +134,9 @@ class _Scan:
         return sum(len(part[0]) for part in self.parts)
 
     def placed(self) -> npt.NDArray[np.float64]:
-        """Return its points (N, 3) in the file's frame."""
-        return np.concatenate([part[0] for part in self.parts]) @ self.matrix[:3, :3] + self.matrix[3, :3]
+        """Return its points (N, 3) in the file's frame; of one that is infinite little is left."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.concatenate([part[0] for part in self.parts]) @ self.matrix[:3, :3] + self.matrix[3, :3]
 
     def take(self, lines: Lines, numbers: npt.NDArray[np.int64]) -> None:
         """Read some of its lines, which have these numbers in the file; raises MalformedFile."""
@@ -206,12 +207,14 @@ def _lines(raw: bytes) -> Iterator[tuple[Lines, npt.NDArray[np.int64]]]:
 def _check_above(above: list[list[bytes]], number: int) -> None:
     """Raise MalformedFile where the last of the lines above a scan, with this number in the file, is no such line."""
     line, wanted = above[-1], _ABOVE[len(above) - 1]
-    are_right = len(line) == wanted
+    is_right = len(line) == wanted
+    if wanted == 1:
+        is_right = is_right and line[0].isdigit() and len(line[0]) <= _COUNT_DIGITS
     try:
-        numbers = [int(line[0])] if wanted == 1 and are_right else [as_number(token) for token in line]
+        [as_number(token) for token in line]
     except ValueError:
-        are_right = False
-    if not are_right or (wanted == 1 and not 0 <= numbers[0] < 2**31):
+        is_right = False
+    if not is_right:
         what = "a number of columns or rows" if wanted == 1 else f"{wanted} numbers of a pose"
         raise MalformedFile(f"line {number} of the PTX file is not {what}, but {shown(b' '.join(line))}")
 

@@ -144,6 +144,19 @@ def test_azimuths_go_on_round_as_the_scan_counts_them(tmp_path: Path) -> None:
     assert np.abs(raw["sphericalAzimuth"] - turned)[flat > 0.5].max() < 0.15
 
 
+def test_what_is_infinite_stays_as_it_is(tmp_path: Path) -> None:
+    xyz = sphere(100)
+    xyz[3], xyz[5, 1], xyz[7] = np.inf, np.nan, 1e308
+    places = {name: Field("Float", column.copy()) for name, column in zip(AXES, xyz.T, strict=True)}
+    cloud, format = read_cloud(write_fields(tmp_path / "a.e57", places, pose=True))
+    moved = cloud.xyz.copy()
+    moved[50:] += 0.25
+    format.write(cloud.with_xyz(moved), tmp_path / "b.e57")
+    (raw,) = raw_scans(tmp_path / "b.e57")
+    np.testing.assert_array_equal(np.stack([raw[name][:50] for name in AXES], axis=1), xyz[:50])
+    np.testing.assert_allclose(read_cloud(tmp_path / "b.e57")[0].xyz[50:], moved[50:], atol=1e-12)
+
+
 def test_normals_that_are_computed_anew_turn_back_with_the_pose(tmp_path: Path) -> None:
     xyz = sphere(900)
     normals = {f"nor:normal{axis}": Field("Float", column.copy()) for axis, column in zip("XYZ", xyz.T, strict=True)}

@@ -39,6 +39,9 @@ def stored(path: Path, *scans: list[str], end: str = "\n") -> Path:
     return path
 
 
+ROWS = [row(point, 0.5) for point in sphere(40)]
+
+
 @pytest.fixture
 def two_scans(tmp_path: Path) -> Path:
     """Two scans, every fifth direction of the first without a point; only the first has a colour."""
@@ -86,6 +89,15 @@ def test_only_what_moved_is_other_text_and_lies_where_it_was_put(two_scans: Path
     np.testing.assert_array_equal(again.xyz[stayed], cloud.xyz[stayed])
 
 
+def test_what_is_no_number_or_infinite_stays_as_it_is_written(tmp_path: Path) -> None:
+    rows = ["nan nan nan 0.5", "inf 1e308 -1e308 0.5", *ROWS]
+    cloud, format = read_cloud(path := stored(tmp_path / "a.ptx", scan(rows)))
+    assert len(cloud) == 42
+    assert not np.isfinite(cloud.xyz[:2]).all(axis=1).any()
+    format.write(cloud.with_xyz(np.vstack([cloud.xyz[:2], cloud.xyz[2:] + 0.25])), tmp_path / "b.ptx")
+    assert (tmp_path / "b.ptx").read_bytes().split(b"\n")[10:12] == path.read_bytes().split(b"\n")[10:12]
+
+
 @pytest.mark.parametrize("name", ["a.txt", "a.pts", "a.xyz", "a"])
 def test_a_file_is_known_by_its_ten_lines_whatever_it_is_called(name: str, two_scans: Path) -> None:
     assert read_cloud(two_scans, name=name)[1].name == "ptx"
@@ -118,9 +130,6 @@ def test_what_would_be_no_point_of_a_new_file_is_refused(point: list[float]) -> 
         PTX.check(PointCloud(np.insert(sphere(40), 4, point, axis=0)))
 
 
-ROWS = [row(point, 0.5) for point in sphere(40)]
-
-
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
@@ -128,6 +137,7 @@ ROWS = [row(point, 0.5) for point in sphere(40)]
         ([*scan(ROWS), *scan(ROWS)[:6]], "truncated: 6 of the 10 lines above scan 2 are there"),
         ([*scan(ROWS), "1 2 3 0.5"], "line 51 of the PTX file is not a number of columns or rows, but '1 2 3 0.5'"),
         ([*scan(ROWS), "1", "1e3"], "line 52 of the PTX file is not a number of columns or rows"),
+        ([*scan(ROWS), "1", "1_0"], "line 52 of the PTX file is not a number of columns or rows, but '1_0'"),
         ([*scan(ROWS), "1", "1", "0 0"], "line 53 of the PTX file is not 3 numbers of a pose"),
         ([*scan(ROWS[:5]), *scan(ROWS)[:9], "0 0 0 2", *ROWS], "matrix above line 26 of the PTX file is no pose"),
         (scan(ROWS, np.zeros((3, 3))), "matrix above line 11 of the PTX file is no pose"),
