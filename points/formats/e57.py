@@ -85,13 +85,11 @@ class E57(Format):
             path.write_bytes(new_e57(cloud))
             return
         _, new, old = changes(cloud, source.xyz, CARTESIAN)
-        changed = np.any(moved(new, old), axis=1)
+        changed = moved(new, old)
         ends = np.cumsum([scan.size for scan in source.scans]).tolist()
         parts = [(scan, slice(end - scan.size, end)) for scan, end in zip(source.scans, ends, strict=True)]
         made = [
-            scan.change(source.file, new[part], old[part], changed[part], has_normals=cloud.normals is not None)
-            for scan, part in parts
-            if changed[part].any()
+            scan.change(source.file, new[part], old[part], changed[part]) for scan, part in parts if changed[part].any()
         ]
         path.write_bytes(with_changes(source.file, made) if made else source.file.raw)
 

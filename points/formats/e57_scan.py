@@ -47,26 +47,31 @@ class E57Scan:
         new: npt.NDArray[np.float64],
         old: npt.NDArray[np.float64],
         changed: npt.NDArray[np.bool_],
-        *,
-        has_normals: bool,
     ) -> ChangedPoints:
-        """Return what is to be written anew of a scan whose points of `changed` (size,) have moved.
+        """Return what is to be written anew of a scan of which the numbers of `changed`, shaped as `new`, are others.
 
         new, old: (size, 3) places in the file's frame, or (size, 6), with normals, where these are new, too.
         """
         rotation, _ = _pose(self.element)
-        local, picked = self._in_own_frame(new[:, :3]), np.flatnonzero(changed)
-        rows = picked if self.rows is None else self.rows[picked]
+        local, picked = self._in_own_frame(new[:, :3]), np.flatnonzero(changed[:, :3].any(axis=1))
+        rows = self._rows_of(picked)
         names = {field.name for field in self.points.fields}
-        values: dict[str, npt.NDArray[np.float64]] = {}
+        found: list[tuple[tuple[str, ...], npt.NDArray[np.int64], npt.NDArray[np.float64]]] = []
         if names.issuperset(CARTESIAN):
-            values |= zip(CARTESIAN, local[picked].T, strict=True)
+            found.append((CARTESIAN, rows, local[picked]))
         if names.issuperset(SPHERICAL):
             azimuths = self.points.read(file)[SPHERICAL[1]][rows]
-            values |= zip(SPHERICAL, _as_spherical(local[picked], azimuths).T, strict=True)
-        if has_normals:
-            values |= zip(NORMAL, (new[picked, 3:] @ rotation).T, strict=True)
-        return ChangedPoints(self.points, rows, values, self._bounds(new[:, :3], old[:, :3]))
+            found.append((SPHERICAL, rows, _as_spherical(local[picked], azimuths)))
+        if new.shape[1] > 3:
+            turned = np.flatnonzero(changed[:, 3:].any(axis=1))
+            found.append((NORMAL, self._rows_of(turned), new[turned, 3:] @ rotation))
+        values = {
+            name: (at, column) for called, at, table in found for name, column in zip(called, table.T, strict=True)
+        }
+        return ChangedPoints(self.points, values, self._bounds(new[:, :3], old[:, :3]))
+
+    def _rows_of(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return points if self.rows is None else self.rows[points]
 
     def _in_own_frame(self, xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         rotation, translation = _pose(self.element)

@@ -35,18 +35,18 @@ _ENTRY = struct.Struct("<QQ")  # the first point of a packet, and where that is
 _LENGTHS_AT = 16  # of the file, of the XML's place and of its length in the file's header
 _LARGEST_PACKET = 1 << 16
 _ALIGNED = 4  # bytes, of sections and packets
+_NOTHING = np.empty(0, np.int64), np.empty(0)
 
 
 @dataclass(frozen=True)
 class ChangedPoints:
-    """Say what has changed of a scan: in `rows` (K,) of its points the fields of `values`, name -> (K,) float64.
+    """Say what has changed of a scan: of fields by their names in which rows (K,) of its points, and to what, (K,).
 
     bounds: what the XML says of all its points, and is to say now.
     """
 
     points: E57Points
-    rows: npt.NDArray[np.int64]
-    values: Mapping[str, npt.NDArray[np.float64]]
+    values: Mapping[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]
     bounds: Mapping[ElementTree.Element, float]
 
 
@@ -149,10 +149,11 @@ def _changed(file: E57File, change: ChangedPoints, edits: XmlEdits) -> tuple[lis
     """Return a scan's fields, with the limits that they now have, and their streams."""
     fields, streams = list(change.points.fields), change.points.streams(file)
     for index, field in enumerate(fields):
-        if (values := change.values.get(field.name)) is not None:
+        rows, values = change.values.get(field.name, _NOTHING)
+        if len(rows):
             column = _Column(field, streams[index], change.points.count)
             put = column.put_floats if field.kind == "Float" else column.put_whole
-            fields[index], streams[index] = put(change.rows, values, edits)
+            fields[index], streams[index] = put(rows, values, edits)
     return fields, streams
 
 
