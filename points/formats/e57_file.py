@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -119,10 +120,11 @@ class E57Points:
         """How many bytes a point takes unpacked."""
         return sum(field.dtype.itemsize for field in self.fields)
 
-    def read(self, file: E57File) -> dict[str, npt.NDArray[Any]]:
-        """Unpack all fields that are numbers: name -> (count,)."""
-        streams = zip(self.fields, self.streams(file), strict=True)
-        return {field.name: _decoded(stream, field, self.count) for field, stream in streams if field.is_number}
+    def read(self, file: E57File, *, only: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+        """Unpack the fields that are numbers, those alone of which `only` holds the names: name -> (count,)."""
+        wanted = [field.is_number and (only is None or field.name in only) for field in self.fields]
+        streams = itertools.compress(zip(self.fields, self.streams(file), strict=True), wanted)
+        return {field.name: _decoded(stream, field, self.count) for field, stream in streams}
 
     def streams(self, file: E57File) -> list[bytes]:
         """Return each field's stream, as long at least as `count` values need; raises MalformedFile."""

@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from straightpcf.points.cloud import NORMALS, PointCloud
-from straightpcf.points.errors import UnsupportedCloud
 from straightpcf.points.formats.colours import RGB, in_8_bits
 from straightpcf.points.formats.e57_bits import bits_packed
 from straightpcf.points.formats.e57_file import HEADER, MAGIC, E57Field, E57Points, scans_of
 from straightpcf.points.formats.e57_pages import PAGE
 from straightpcf.points.formats.e57_scan import CALLED, CARTESIAN, SPHERICAL, STATES, Columns
 from straightpcf.points.formats.e57_write import in_file, put_section, section_of
+from straightpcf.points.formats.positions import check_held
 from straightpcf.points.formats.scalars import not_held, scalar_columns, with_intensity
 
 __all__ = ["TYPES", "check_new", "lost", "new_e57"]
@@ -71,12 +71,8 @@ def lost(cloud: PointCloud) -> list[str]:
 
 def check_new(cloud: PointCloud) -> None:
     """Raise UnsupportedCloud where `new_e57` would: E57's numbers are no NaN, and what is no point is left out."""
-    finite = np.isfinite(cloud.xyz).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise UnsupportedCloud(
-            f"point {row} is {cloud.xyz[row].tolist()}, which an E57 file does not hold: take another format, as PLY"
-        )
+    held = np.isfinite(cloud.xyz).all(axis=1)
+    check_held(cloud.xyz, held, ", which an E57 file does not hold: take another format, as PLY")
 
 
 def new_e57(cloud: PointCloud) -> bytes:
@@ -96,7 +92,10 @@ def new_e57(cloud: PointCloud) -> bytes:
 
 def _described(columns: Columns, count: int, place: int) -> bytes:
     """Return the XML of a scan of (count,) columns that begins at this place, with ids that are these columns'."""
-    digest = hashlib.sha256(b"".join(values.tobytes() for values in columns.values())).hexdigest()
+    hashed = hashlib.sha256()
+    for values in columns.values():
+        hashed.update(values.tobytes())
+    digest = hashed.hexdigest()
     return _XML.format(
         root=_ROOT,
         file=uuid.uuid5(uuid.NAMESPACE_OID, f"file {digest}"),

@@ -40,12 +40,8 @@ def checksums(pages: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
 def in_pages(content: bytearray) -> bytes:
     """Return a file of this content, in whole pages with their checksums."""
     count = -(-len(content) // PAYLOAD)
-    pages = np.zeros((count, PAGE), np.uint8)
-    whole = len(content) // PAYLOAD
-    pages[:whole, :PAYLOAD] = np.frombuffer(content, np.uint8, whole * PAYLOAD).reshape(whole, PAYLOAD)
-    if count > whole:
-        rest = np.frombuffer(content, np.uint8, offset=whole * PAYLOAD)
-        pages[whole, : len(rest)] = rest
+    pages = np.empty((count, PAGE), np.uint8)
+    pages[:, :PAYLOAD] = np.frombuffer(content.ljust(count * PAYLOAD, b"\0"), np.uint8).reshape(count, PAYLOAD)
     pages[:, PAYLOAD:] = checksums(pages).astype(">u4")[:, None].view(np.uint8)
     return pages.tobytes()
 

@@ -60,7 +60,7 @@ class E57Scan:
         if names.issuperset(CARTESIAN):
             found.append((CARTESIAN, rows, local[picked]))
         if names.issuperset(SPHERICAL):
-            azimuths = self.points.read(file)[SPHERICAL[1]][rows]
+            azimuths = self.points.read(file, only=SPHERICAL[1:2])[SPHERICAL[1]][rows]
             found.append((SPHERICAL, rows, _as_spherical(local[picked], azimuths)))
         if new.shape[1] > 3:
             turned = np.flatnonzero(changed[:, 3:].any(axis=1))
@@ -68,7 +68,7 @@ class E57Scan:
         values = {
             name: (at, column) for called, at, table in found for name, column in zip(called, table.T, strict=True)
         }
-        return ChangedPoints(self.points, values, self._bounds(new[:, :3], old[:, :3]))
+        return ChangedPoints(self.points, values, self._bounds(new[:, :3], local, old[:, :3]))
 
     def _rows_of(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         return points if self.rows is None else self.rows[points]
@@ -77,12 +77,14 @@ class E57Scan:
         rotation, translation = _pose(self.element)
         return (xyz - translation) @ rotation
 
-    def _bounds(self, new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]) -> dict[ElementTree.Element, float]:
-        """Return what the scan says of the bounds of its points, (size, 3) before and now, and is to say.
+    def _bounds(
+        self, new: npt.NDArray[np.float64], now: npt.NDArray[np.float64], old: npt.NDArray[np.float64]
+    ) -> dict[ElementTree.Element, float]:
+        """Return what the scan says of the bounds of its points, and is to say: new, old: (size, 3); now: new, its own.
 
         Those of E2807 are in the scan's own frame; pye57 writes the file's. They stay in the frame that they are in.
         """
-        was, now = self._in_own_frame(old), self._in_own_frame(new)
+        was = self._in_own_frame(old)
         spherical = _as_spherical(now, np.zeros(len(now)))
         own, of_file = (self._ends("cartesianBounds", ("x", "y", "z"), xyz) for xyz in (was, old))
         is_of_file = _off(of_file) < _off(own)  # of no numbers neither is

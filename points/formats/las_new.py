@@ -20,7 +20,7 @@ from straightpcf.points.formats.las_layout import (
     standard_bytes,
     standard_dimensions,
 )
-from straightpcf.points.formats.positions import from_middle, rounding
+from straightpcf.points.formats.positions import check_held, from_middle, rounding
 from straightpcf.points.formats.scalars import meant, scalar_columns
 
 __all__ = ["TAKEN", "TYPES", "as_dimensions", "check_new", "new_las", "renamed"]
@@ -107,10 +107,7 @@ def _laid_out(
 
 
 def _check_positions(xyz: npt.NDArray[np.float64]) -> None:
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise UnsupportedCloud(f"point {row} is {xyz[row].tolist()}; LAS has no place for NaN and infinity")
+    check_held(xyz, np.isfinite(xyz).all(axis=1), "; LAS has no place for NaN and infinity")
     if len(xyz) and np.abs(xyz).max() > 1e100:
         raise UnsupportedCloud(f"a coordinate of {np.abs(xyz).max():g} is beyond 1e100, which LAS is not written for")
 

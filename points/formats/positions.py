@@ -16,6 +16,7 @@ __all__ = [
     "WRITTEN",
     "axes_among",
     "changes",
+    "check_held",
     "from_middle",
     "gathered",
     "moved",
@@ -56,6 +57,13 @@ def moved(new: npt.NDArray[np.float64], old: npt.NDArray[np.float64]) -> npt.NDA
     changed: npt.NDArray[np.bool_] = new != old
     changed &= ~(np.isnan(new) & np.isnan(old))
     return changed
+
+
+def check_held(xyz: npt.NDArray[np.float64], held: npt.ArrayLike, why: str) -> None:
+    """Raise UnsupportedCloud with the first of (N, 3) points that a format does not hold; held: (N,), which it does."""
+    if not np.all(held):
+        row = int(np.argmin(held))
+        raise UnsupportedCloud(f"point {row} is {xyz[row].tolist()}{why}")
 
 
 def widened(columns: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:

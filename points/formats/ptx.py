@@ -15,7 +15,7 @@ from straightpcf.points.cloud import PointCloud
 from straightpcf.points.errors import MalformedFile, UnsupportedCloud
 from straightpcf.points.formats.base import Format, check_count
 from straightpcf.points.formats.colours import RGB
-from straightpcf.points.formats.positions import moved
+from straightpcf.points.formats.positions import check_held, moved
 from straightpcf.points.formats.text import Lines, as_number, as_numbers, blocks, refuse_binary, replaced, shown
 from straightpcf.points.formats.text_new import axis_columns, intensity_and_colour, lost_of_colour, table_lines
 from straightpcf.points.formats.xyz_layout import PTS_COLUMNS
@@ -76,15 +76,15 @@ class Ptx(Format):
         common = [name for name in scans[0].names if all(name in scan.names for scan in scans)]
         others = dict.fromkeys(name for scan in scans for name in scan.names if name not in common)
         local, starts, ends = (np.concatenate([part[of] for scan in scans for part in scan.parts]) for of in (0, 1, 2))
-        attributes = {
-            name: np.concatenate([part[3][:, scan.names.index(name)] for scan in scans for part in scan.parts])
-            for name in common
-        }
-        counts = [scan.count for scan in scans]
         xyz = np.concatenate([scan.placed() for scan in scans])
-        columns = {name: _whole(values) if name in RGB else values for name, values in attributes.items()}
+        columns: dict[str, npt.NDArray[Any]] = {}
+        for name in common:
+            values = np.concatenate([part[3][:, scan.names.index(name)] for scan in scans for part in scan.parts])
+            columns[name] = _whole(values) if name in RGB else values
         if len(scans) > 1:
-            columns[_SCAN] = np.repeat(np.array([scan.number for scan in scans], np.uint32), counts)
+            columns[_SCAN] = np.repeat(
+                np.array([scan.number for scan in scans], np.uint32), [scan.count for scan in scans]
+            )
         poses = tuple((scan.matrix, scan.count) for scan in scans)
         return PointCloud(xyz, columns, PtxSource(raw, starts, ends, local, xyz.copy(), poses), beside=tuple(others))
 
@@ -97,11 +97,7 @@ class Ptx(Format):
         if isinstance(cloud.source, PtxSource):
             return
         is_point = np.isfinite(cloud.xyz).all(axis=1) & cloud.xyz.any(axis=1)
-        if not is_point.all():
-            row = int(np.argmin(is_point))
-            raise UnsupportedCloud(
-                f"point {row} is {cloud.xyz[row].tolist()}, which is none in a PTX file: take another format, as PLY"
-            )
+        check_held(cloud.xyz, is_point, ", which is none in a PTX file: take another format, as PLY")
 
     def write(self, cloud: PointCloud, path: Path) -> None:
         """Write the file that was read, the numbers of what moved in its scan's frame; or a new one."""
