@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
+from straightpcf.model.bent import parts_of_object
 from straightpcf.model.calibration import DENSE_FROM_RADII, Calibration
 from straightpcf.model.low_noise import noise_on_surfaces
 from straightpcf.model.normalize import (
@@ -223,8 +225,7 @@ class NoiseReader:
         """Say how the first pass shows an object; distances: what the DistanceModule says of its probes, (M,)."""
         noise = self._noise_std(distances, scales)
         sampling = Sampling.of(positions, probes, noise, survey=self._processor.survey)
-        if view is not None:
-            sampling = replace(sampling, irregular=True)
+        sampling = sampling if view is None else replace(sampling, irregular=True)
         in_radii = noise_in_radii(noise, probes.radii)
         distance = float(np.median(distances))
         reading = Reading(distance, noise, False, sampling, noise_in_radii=in_radii, view=view, probes=probes)
@@ -237,10 +238,15 @@ class NoiseReader:
             reading,
             noise_std=noise,
             zoom=zoom,
-            parts=parts_of(noise, probes.radii, len(positions)),
+            parts=parts_of_object(noise, probes.radii, len(positions), partial(self._part, positions, tiling)),
             high_noise=noise > HIGH_NOISE and self._has_high_noise(positions, tiling, noise, radius),
             uneven=_is_uneven(self.noise_stds(distances, scales), zoom),
         )
+
+    def _part(self, positions: Floats, tiling: Tiling, parts: int) -> tuple[Floats, Patches]:
+        """Return one of so many parts of the points, and some of its patches."""
+        some = positions[tiling.subsamples(parts)[0]] if parts > 1 else positions
+        return some, (self._tile(some) if parts > 1 else tiling).probes(_REREAD_PROBES)[0]
 
     def _next_of_object(
         self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, first: Reading

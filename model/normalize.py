@@ -50,6 +50,8 @@ _LARGEST_ZOOM, _LARGEST_ZOOMED_RADIUS = 2.5, 0.65
 _NOISE_PER_PART, _BOTH_RANGE = 0.062, (1.25, 1.75)
 _UNZOOMED_NOISE, _UNZOOMED_BOTH_FROM = 0.9 * _SHOWN_NOISE, 1.0
 _MOST_PARTS, _SMALLEST_PART = 6, 2000
+# A surface that is nothing but bent (`model.bent`) is filtered in so many that noise is so large in a part's patches.
+_NOISE_OF_BENT, _MOST_PARTS_OF_BENT = 0.045, 24
 _BLOCK = 2**16  # rows whose distances are held at once
 
 
@@ -152,7 +154,7 @@ def noise_in_radii(noise_std: float, radii: npt.NDArray[np.float64]) -> float:
     return noise_std / max(float(np.median(radii)), 1e-9)
 
 
-def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tuple[int, ...]:
+def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int, *, bent: bool = False) -> tuple[int, ...]:
     """Return in how many parts a pass filters `count` points, each by itself: (1,) where patches reach far enough.
 
     (1, 2): as a whole and in two parts, and takes the mean of both, which on the border between the two is better than
@@ -161,8 +163,14 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int) -> tu
     noise_std, radii: in the unit ball, radii of some patches of the whole cloud. A patch is the 1000 nearest points,
     however dense the cloud: where noise is as large as a patch, no network can tell where the surface is. A part of m
     has patches of sqrt(m) times the radius, at the same cost (docs/filter.md, "Parts").
+
+    bent: whether the surface is nothing but bent: larger patches join nothing, and leave no layers.
     """
-    wanted = noise_in_radii(noise_std, radii) / _NOISE_PER_PART
+    in_radii = noise_in_radii(noise_std, radii)
+    if bent:
+        most = max(1, min(_MOST_PARTS_OF_BENT, count // _SMALLEST_PART))
+        return (max(1, min(round((in_radii / _NOISE_OF_BENT) ** 2), most)),)
+    wanted = in_radii / _NOISE_PER_PART
     most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
     lowest = _BOTH_RANGE[0] if noise_std < _UNZOOMED_NOISE else _UNZOOMED_BOTH_FROM
     if lowest <= wanted < _BOTH_RANGE[1] and most > 1:

@@ -24,6 +24,7 @@ from straightpcf.model.train.bodies import carving, creature
 from straightpcf.model.train.casings import CASINGS, UNSEEN
 from straightpcf.model.train.command import archive_to_write, errors_in_one_line, positive, seed_number
 from straightpcf.model.train.level_set import LevelSet
+from straightpcf.model.train.open_sheets import OPEN_SHEETS, OpenSheet
 from straightpcf.model.train.primitives import (
     Box,
     Cylinder,
@@ -241,9 +242,10 @@ FAMILIES: Sequence[Callable[[np.random.Generator], Solid | LevelSet]] = [
     carving,
 ]
 # What an archive may hold; "unseen" is for judging alone.
-KINDS: Mapping[str, Sequence[Callable[[np.random.Generator], Solid | LevelSet]]] = {
+KINDS: Mapping[str, Sequence[Callable[[np.random.Generator], Solid | LevelSet | OpenSheet]]] = {
     "solid": FAMILIES,
     "casing": CASINGS,
+    "open": OPEN_SHEETS,
     "unseen": UNSEEN,
 }
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from straightpcf.model.bent import parts_of_object
 from straightpcf.model.filter import MIN_POINTS, DenoiseResult, Filter, load_filter
-from straightpcf.model.normalize import parts_of
 from straightpcf.points.errors import InvalidCloud, InvalidOptions, JobCanceled, TooFewPoints
 from straightpcf.points.options import DenoiseOptions
 from tests.clouds import distance_to_torus, even_sphere, far_group, noisy, sphere, torus
@@ -333,10 +333,10 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
     wanted: list[int] = []
 
     def parts(*given: Any) -> tuple[int, ...]:
-        wanted.append(parts_of(*given))
+        wanted.append(parts_of_object(*given))
         return wanted[-1]
 
-    monkeypatch.setattr("straightpcf.model.noise.parts_of", parts)
+    monkeypatch.setattr("straightpcf.model.noise.parts_of_object", parts)
     filtered, seen = cloud.copy(), []
     for patch in shipped.patches(cloud, ONE_PASS):
         filtered[patch.indices] = patch.xyz
@@ -347,11 +347,18 @@ def test_a_dense_cloud_is_parted_where_its_noise_fills_the_patches(
     assert after < 0.4 * before
 
 
+def test_an_open_sheet_with_more_noise_than_any_in_training_does_not_end_in_layers(shipped: Filter) -> None:
+    square = np.random.default_rng(0).uniform([-0.7, -0.7, 0], [0.7, 0.7, 0], (10_000, 3))
+    filtered = shipped.denoise(noisy(square, 0.04), DenoiseOptions(iterations=2)).xyz
+    # In whole, or in the parts of a body, twice as far: half of the points in either layer.
+    assert np.median(np.abs(filtered[:, 2])) < 0.006
+
+
 @pytest.mark.parametrize("parts", [(3,), (1, 2)])
 def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
     tiny: Filter, monkeypatch: pytest.MonkeyPatch, parts: tuple[int, ...]
 ) -> None:
-    monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_: parts)
+    monkeypatch.setattr("straightpcf.model.noise.parts_of_object", lambda *_: parts)
     monkeypatch.setattr("straightpcf.model.filter.MIN_TILE_POINTS", 4000)
     cloud = noisy(torus(4400), 0.01)
     options = DenoiseOptions(iterations=1)
@@ -366,7 +373,7 @@ def test_parts_and_tiles_add_up_to_the_result_whatever_the_thread_count(
 def test_as_a_whole_and_in_parts_is_the_mean_of_both(tiny: Filter, monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, results = noisy(torus(2500), 0.02), []
     for parts in ((1,), (2,), (1, 2)):
-        monkeypatch.setattr("straightpcf.model.noise.parts_of", lambda *_, parts=parts: parts)
+        monkeypatch.setattr("straightpcf.model.noise.parts_of_object", lambda *_, parts=parts: parts)
         patches = list(tiny.patches(cloud, ONE_PASS))
         order = np.concatenate([patch.indices for patch in patches])
         assert np.array_equal(np.sort(order), np.arange(len(cloud)))

@@ -95,6 +95,14 @@ def test_between_one_part_and_two_a_cloud_is_filtered_as_both() -> None:
     assert [parts_of(0.03, np.array([radius]), 10_000) for radius in (0.485, 0.483)] == [(1,), (1, 2)]
 
 
+def test_what_is_nothing_but_bent_is_filtered_in_so_many_parts_that_noise_is_small_beside_their_patches() -> None:
+    radii = np.array([0.15])
+    parts = [parts_of(noise, radii, 50_000, bent=True) for noise in (0.008, 0.0097, 0.0135, 0.027, 0.05)]
+    assert parts == [(1,), (2,), (4,), (16,), (24,)]
+    assert parts_of(0.027, radii, 10_000, bent=True) == (5,)
+    assert parts_of(0.0, np.array([0.0]), 10_000, bent=True) == (1,)
+
+
 @given(st.floats(0, 1), st.floats(0, 1), st.integers(1, 200_000))
 def test_no_part_is_too_small(noise: float, radius: float, count: int) -> None:
     parts = parts_of(noise, np.array([radius]), count)

@@ -83,7 +83,7 @@ def test_coarse_solids_are_drawn_from_and_the_finest_is_their_surface(
     np.testing.assert_array_equal(coarse.surfaces[0].xyz, whole.surfaces[0].xyz)
     with pytest.raises(ValueError, match="resolutions are 2000, 5000, not 3000"):
         write_solids(tmp_path / "none.npz", 1, resolutions=[3000])
-    with pytest.raises(ValueError, match="kinds are solid, casing, unseen, not cube"):
+    with pytest.raises(ValueError, match="kinds are solid, casing, open, unseen, not cube"):
         write_solids(tmp_path / "none.npz", 1, kind="cube")
 
 

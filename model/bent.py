@@ -1,0 +1,70 @@
+"""Objects that are nothing but a bent surface, such as open sheets: much noise is filtered in more parts there.
+
+A part's patches reach farther. On a body they join what is apart; on a sheet there is nothing to join, and they tell it
+better from its noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from straightpcf.model.neighbourhoods import surface_terms
+from straightpcf.model.normalize import noise_in_radii, parts_of
+from straightpcf.model.patches import Patches
+
+__all__ = ["off_quadric", "parts_of_object"]
+
+Floats = npt.NDArray[np.float64]
+Look = Callable[[int], tuple[Floats, Patches]]
+
+# An object is nothing but bent where four in five of its patches, in which noise is so large in their radii, lie no
+# farther from a quadric than so many noise stds, and half of a part's patches no farther than so many.
+_BENT_WITHIN, _BENT_SHARE = 0.1, 0.8
+_BENT_STDS, _PART_STDS = 1.25, 1.5
+# With more noise than any in training a sheet ends in layers, which cost more than what larger patches take of a shape.
+# So much is read of 4 % on sheets: somewhat less than there is.
+_LAYERS_NOISE, _LAYERS_BENT_STDS, _LAYERS_PART_STDS = 0.0325, 1.4, 2.5
+# From so much on walls are read as noise that are not, and then lie no farther from a quadric than that.
+_MOST_NOISE = 0.055
+# The kurtosis of what is off the quadric, in half of those patches: normal noise has 3, and somewhat less where a patch
+# cuts it off; two walls closer than noise have less, and noise with long tails, which hides them from this, has more.
+_LEAST_KURTOSIS, _MOST_KURTOSIS = 2.85, 3.3
+
+
+def parts_of_object(noise_std: float, radii: Floats, count: int, look: Look) -> tuple[int, ...]:
+    """Return in how many parts a pass filters an object of `count` points: as `parts_of`, more if it is only bent.
+
+    noise_std, radii: as of that. look: returns one of so many parts of the points, (M, 3), and some of its patches.
+    """
+    usual, bent = (parts_of(noise_std, radii, count, bent=is_so) for is_so in (False, True))
+    if bent <= usual[-1:] or noise_std > _MOST_NOISE:
+        return usual
+    layers = noise_std > _LAYERS_NOISE
+    stds, kurtoses = _off(*look(max(1, round((noise_in_radii(noise_std, radii) / _BENT_WITHIN) ** 2))))
+    if np.quantile(stds, _BENT_SHARE) > (_LAYERS_BENT_STDS if layers else _BENT_STDS) * noise_std:
+        return usual
+    if not _LEAST_KURTOSIS < np.median(kurtoses) < _MOST_KURTOSIS:
+        return usual
+    of_parts, _ = _off(*look(bent[0]))
+    return bent if np.median(of_parts) < (_LAYERS_PART_STDS if layers else _PART_STDS) * noise_std else usual
+
+
+def off_quadric(points: Floats) -> tuple[float, float]:
+    """Return the std and the kurtosis of points (n, 3) off the quadric, over their plane, that fits them best."""
+    local = points - points.mean(axis=0)
+    axes = np.linalg.eigh(local.T @ local)[1]  # the one across the plane is the first
+    along = local @ axes
+    heights = along[:, 0].copy()
+    along /= max(np.abs(along).max(), 1e-300)
+    terms = surface_terms(along[None], bent=True)[0]
+    squares = np.square(heights - terms @ np.linalg.lstsq(terms, heights, rcond=None)[0])
+    std = np.sqrt(squares.sum() / max(len(squares) - terms.shape[1], 1))
+    return float(std), float(np.square(squares).mean() / max(squares.mean() ** 2, 1e-300))
+
+
+def _off(positions: Floats, patches: Patches) -> Floats:
+    """Return what `off_quadric` does of patches, (2, M)."""
+    return np.array([off_quadric(positions[rows]) for rows in patches.index]).T
