@@ -11,11 +11,12 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from straightpcf.model.neighbourhoods import surface_terms
+from straightpcf.model.neighbourhoods import Nearest
 from straightpcf.model.normalize import noise_in_radii, parts_of
 from straightpcf.model.patches import Patches
+from straightpcf.model.walls import LocalFit
 
-__all__ = ["off_quadric", "parts_of_object"]
+__all__ = ["off_quadrics", "parts_of_object"]
 
 Floats = npt.NDArray[np.float64]
 Look = Callable[[int], tuple[Floats, Patches]]
@@ -43,28 +44,21 @@ def parts_of_object(noise_std: float, radii: Floats, count: int, look: Look) -> 
     if bent <= usual[-1:] or noise_std > _MOST_NOISE:
         return usual
     layers = noise_std > _LAYERS_NOISE
-    stds, kurtoses = _off(*look(max(1, round((noise_in_radii(noise_std, radii) / _BENT_WITHIN) ** 2))))
+    stds, kurtoses = off_quadrics(*look(max(1, round((noise_in_radii(noise_std, radii) / _BENT_WITHIN) ** 2))))
     if np.quantile(stds, _BENT_SHARE) > (_LAYERS_BENT_STDS if layers else _BENT_STDS) * noise_std:
         return usual
     if not _LEAST_KURTOSIS < np.median(kurtoses) < _MOST_KURTOSIS:
         return usual
-    of_parts, _ = _off(*look(bent[0]))
+    of_parts, _ = off_quadrics(*look(bent[0]))
     return bent if np.median(of_parts) < (_LAYERS_PART_STDS if layers else _PART_STDS) * noise_std else usual
 
 
-def off_quadric(points: Floats) -> tuple[float, float]:
-    """Return the std and the kurtosis of points (n, 3) off the quadric, over their plane, that fits them best."""
-    local = points - points.mean(axis=0)
-    axes = np.linalg.eigh(local.T @ local)[1]  # the one across the plane is the first
-    along = local @ axes
-    heights = along[:, 0].copy()
-    along /= max(np.abs(along).max(), 1e-300)
-    terms = surface_terms(along[None], bent=True)[0]
-    squares = np.square(heights - terms @ np.linalg.lstsq(terms, heights, rcond=None)[0])
-    std = np.sqrt(squares.sum() / max(len(squares) - terms.shape[1], 1))
-    return float(std), float(np.square(squares).mean() / max(squares.mean() ** 2, 1e-300))
-
-
-def _off(positions: Floats, patches: Patches) -> Floats:
-    """Return what `off_quadric` does of patches, (2, M)."""
-    return np.array([off_quadric(positions[rows]) for rows in patches.index]).T
+def off_quadrics(positions: Floats, patches: Patches) -> tuple[Floats, Floats]:
+    """Return the std and the kurtosis, (M,) each, of what patches of (N, 3) points are off the best quadric."""
+    near = Nearest(patches.radii[:, None], positions[patches.index]).first(patches.index.shape[1])
+    along = near.along_axes()
+    fit = LocalFit.of(along, near.radii)
+    squares = np.square(fit.residuals(along[:, :, 0]))
+    _, count, terms = fit.terms.shape
+    stds = np.sqrt(squares.sum(axis=1) / max(count - terms, 1))
+    return stds, np.square(squares).mean(axis=1) / np.maximum(np.square(squares.mean(axis=1)), 1e-300)

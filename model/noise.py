@@ -243,11 +243,6 @@ class NoiseReader:
             uneven=_is_uneven(self.noise_stds(distances, scales), zoom),
         )
 
-    def _part(self, positions: Floats, tiling: Tiling, parts: int) -> tuple[Floats, Patches]:
-        """Return one of so many parts of the points, and some of its patches."""
-        some = positions[tiling.subsamples(parts)[0]] if parts > 1 else positions
-        return some, (self._tile(some) if parts > 1 else tiling).probes(_REREAD_PROBES)[0]
-
     def _next_of_object(
         self, positions: Floats, tiling: Tiling, probes: Patches, distances: Floats, scales: Floats, first: Reading
     ) -> Reading:
@@ -339,8 +334,7 @@ class NoiseReader:
         """Do what `_noise_of_scene` does where it is more than the table knows: of a quarter of the points, or less."""
         noise_of_most = np.inf
         for zoom in _REREAD_ZOOMS:
-            some = self._subsampled(positions, tiling, zoom)
-            probes, _ = self._tile(some).probes(_REREAD_PROBES)
+            some, probes = self._part(positions, tiling, _parts(positions, zoom))
             again, noise_of_most = self._noise_of_scene(self.of_scene(some, probes, raster=raster), probes)
             noise = max(noise, again)
             if np.isfinite(noise_of_most):
@@ -353,20 +347,20 @@ class NoiseReader:
         thinned = max(zoom, radius * zoom / _NEAR_RADIUS)
         if _parts(positions, thinned) == _parts(positions, zoom):  # what was read reaches no farther
             return True
-        near = self._read_points_at_zoom(self._subsampled(positions, tiling, thinned), zoom)
+        near = self._read_part_at_zoom(*self._part(positions, tiling, _parts(positions, thinned)), zoom)
         return (noise + near) / 2 > HIGH_NOISE
 
-    def _subsampled(self, positions: Floats, tiling: Tiling, zoom: float) -> Floats:
-        """Return so few points that patches are as large as before where they are shown zoom times their size."""
-        return positions[tiling.subsamples(_parts(positions, zoom))[0]]
+    def _part(self, positions: Floats, tiling: Tiling, parts: int) -> tuple[Floats, Patches]:
+        """Return one of so many parts of the points, and some of its patches."""
+        some = positions[tiling.subsamples(parts)[0]] if parts > 1 else positions
+        return some, (self._tile(some) if parts > 1 else tiling).probes(_REREAD_PROBES)[0]
 
     def _read_at_zoom(self, positions: Floats, tiling: Tiling, zoom: float) -> float:
         """Read the noise of an object shown smaller, of so few of its points that patches are as large as before."""
-        return self._read_points_at_zoom(self._subsampled(positions, tiling, zoom), zoom)
+        return self._read_part_at_zoom(*self._part(positions, tiling, _parts(positions, zoom)), zoom)
 
-    def _read_points_at_zoom(self, some: Floats, zoom: float) -> float:
+    def _read_part_at_zoom(self, some: Floats, probes: Patches, zoom: float) -> float:
         """Read the noise of some points of an object shown smaller."""
-        probes, _ = self._tile(some).probes(_REREAD_PROBES)
         scales = patch_scales(probes.radii, scene=False, zoom=zoom)
         return self._noise_std(self._processor.distances(some, probes, scales), scales)
 
@@ -382,7 +376,7 @@ def _is_uneven(noise_stds: Floats, zoom: float) -> bool:
 
 
 def _parts(positions: Floats, zoom: float) -> int:
-    """Return of how many parts of the points one is as few as `NoiseReader._subsampled` asks for, and not too few."""
+    """Return of how many parts one, shown zoom times its size, has patches as large as all points; none too few."""
     return max(1, min(round(1 / zoom**2), len(positions) // _REREAD_POINTS))
 
 

@@ -167,11 +167,10 @@ def parts_of(noise_std: float, radii: npt.NDArray[np.float64], count: int, *, be
     bent: whether the surface is nothing but bent: larger patches join nothing, and leave no layers.
     """
     in_radii = noise_in_radii(noise_std, radii)
+    most = max(1, min(_MOST_PARTS_OF_BENT if bent else _MOST_PARTS, count // _SMALLEST_PART))
     if bent:
-        most = max(1, min(_MOST_PARTS_OF_BENT, count // _SMALLEST_PART))
         return (max(1, min(round((in_radii / _NOISE_OF_BENT) ** 2), most)),)
     wanted = in_radii / _NOISE_PER_PART
-    most = max(1, min(_MOST_PARTS, count // _SMALLEST_PART))
     lowest = _BOTH_RANGE[0] if noise_std < _UNZOOMED_NOISE else _UNZOOMED_BOTH_FROM
     if lowest <= wanted < _BOTH_RANGE[1] and most > 1:
         return (1, 2)

@@ -14,7 +14,15 @@ import numpy.typing as npt
 from straightpcf.model.arrays import Array, namespace, on_host
 from straightpcf.model.neighbourhoods import INNER_SHARE, Nearest, Neighbourhoods, surface_terms
 
-__all__ = ["WALL_PATCHES_SHARE", "has_walls", "hiding_share", "midway_shares", "share_between_walls", "showing_share"]
+__all__ = [
+    "WALL_PATCHES_SHARE",
+    "LocalFit",
+    "has_walls",
+    "hiding_share",
+    "midway_shares",
+    "share_between_walls",
+    "showing_share",
+]
 
 Floats = npt.NDArray[np.float64]
 
@@ -56,14 +64,14 @@ class _Heights:
     thick: Array
     midway: Array
     heights: Array
-    fit: _LocalFit
+    fit: LocalFit
     normals: Array
 
     @classmethod
     def of(cls, near: Neighbourhoods) -> _Heights:
         """Look at the neighbourhoods of n points."""
         along = near.along_axes()
-        fit = _LocalFit.of(along, near.radii)
+        fit = LocalFit.of(along, near.radii)
         heights = fit.residuals(along[:, :, 0])
         xp = namespace(heights)
         stds = xp.sqrt(xp.square(heights).mean(1))
@@ -95,7 +103,7 @@ class _Heights:
 
 
 @dataclass(frozen=True)
-class _LocalFit:
+class LocalFit:
     """Planes or quadrics over the neighbourhoods of n points, for least squares.
 
     terms: (n, k, m), those of each neighbour; inverse: (n, m, m), of the normal equations.
@@ -105,7 +113,7 @@ class _LocalFit:
     inverse: Array
 
     @classmethod
-    def of(cls, along: Array, radii: Array) -> _LocalFit:
+    def of(cls, along: Array, radii: Array) -> LocalFit:
         """Take quadrics where there are as many neighbours as _QUADRIC_FROM; along: (n, k, 3), as `along_axes` says."""
         terms = surface_terms(along / radii[:, None, None], bent=along.shape[1] >= _QUADRIC_FROM)
         equations = terms.mT @ terms

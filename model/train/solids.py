@@ -1,4 +1,4 @@
-"""Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, and smooth bodies.
+"""Training clouds made in code: thin-walled solids of plates, tubes, shells, ribs and rods, smooth bodies, open sheets.
 
 python -m straightpcf.model.train.solids solids.npz --count 36
 python -m straightpcf.model.train.solids casings.npz --kind casing

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from straightpcf.model.bent import off_quadric, parts_of_object
+from straightpcf.model.bent import off_quadrics, parts_of_object
 from straightpcf.model.normalize import parts_of
 from straightpcf.model.patches import Patches
 from straightpcf.model.tiles import Tiling
@@ -127,6 +127,15 @@ def test_nothing_is_looked_at_where_patches_reach_far_beside_the_noise() -> None
     parts, _, _, looked = _parts(_square, 0.01)
     assert parts == (1,)
     assert looked == []
+
+
+def off_quadric(points: Floats) -> tuple[float, float]:
+    """Return the std and the kurtosis of a patch of all points off a quadric."""
+    around = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    rows = np.argsort(around, kind="stable").astype(np.int32)[None]
+    patch = Patches(rows[0, :1].astype(np.int64), rows, np.array([len(points)]), around.max(keepdims=True))
+    stds, kurtoses = off_quadrics(points, patch)
+    return float(stds.item()), float(kurtoses.item())
 
 
 @settings(deadline=None, max_examples=30)
