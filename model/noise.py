@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,17 +28,21 @@ from straightpcf.model.patches import Patches
 from straightpcf.model.planes import across_planes, thickness_of, thickness_ratios
 from straightpcf.model.processor import Floats, Processor
 from straightpcf.model.raster import height_axis
+from straightpcf.model.reading import Reading, ScenePatches
 from straightpcf.model.spacing import Sampling
 from straightpcf.model.tiles import Tiling
 from straightpcf.model.views import View
 
-__all__ = ["NoiseReader", "Reading", "ScenePatches"]
+__all__ = ["NoiseReader"]
 
 # d says no more than the largest noise of the calibration's table, and of a dense cloud it says too little before that.
 # From this share of it on, noise is read again of points fewer and nearer: of patches as large, in an object made
 # smaller. What is read there counts where it is above what the table knew: thin walls look like noise when small.
 _REREAD_ZOOMS, _REREAD_PROBES, _REREAD_POINTS = (0.5, 0.25), 24, 2500
 _REREAD_FROM, _REREAD_ABOVE = 0.4, 0.95
+# A part of the points has larger patches. Noise above such a share of its patches' radii is read of more and more parts
+# until it is below the other: the more the patches of dense points are full of it, the less of it d says.
+_DENSE_RADII, _TOLD_RADII = 0.15, 0.12
 # Where patches reach far, thin walls and bends are read as noise, so what is high there is read once more, of more of
 # the points shown at half their size, in patches no larger than this.
 _NEAR_RADIUS = 0.15
@@ -58,57 +62,6 @@ _MOST_ON_SURFACES_RATIO = 3.0
 # A patch is flat where its points lie no farther from their plane than so many of its noise stds, and than such a share
 # of how far they spread along it: the network sees noise in a tree, too.
 _FLAT_PATCH_STDS, _FLAT_RATIO = 1.3, 0.4
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What was read of a cloud before a pass.
-
-    distance: the DistanceModule's median over some patches; noise_std: in the unit ball; scene: whether the cloud is no
-    object seen whole, a raster among them; sampling: how its points lie; zoom: the factor by which the pass shows an
-    object larger; parts: in how many it filters it (`parts_of`); noise_in_radii: an object's noise std in radii of its
-    patches, before the first pass (a scene's are shown in sizes of their own, and d says as much); known_distances:
-    what the DistanceModule said of patches of that pass, by number; noise_of_most: the noise std that four fifths of a
-    scene's points have, or less; most_on_surfaces: what is believed of any place of a scene by a few neighbours, before
-    the first pass; high_noise: whether an object has more noise than HIGH_NOISE, before the first pass;
-    uneven: whether that pass shows no patch larger than the noise in it asks for; height_axis: that of the heights of a
-    raster, None of any other cloud; view: the place that the cloud was seen from, before the first pass, None where its
-    points are no raster of beams; probes: the patches that were read; thickness: of the surface that a pass has left of
-    dense points, the median of the std of each point's nearest across their plane by the lesser one along it.
-    """
-
-    distance: float
-    noise_std: float
-    scene: bool
-    sampling: Sampling
-    zoom: float = 1.0
-    parts: tuple[int, ...] = (1,)
-    noise_in_radii: float = 0.0
-    known_distances: Mapping[int, float] = field(default_factory=dict)
-    noise_of_most: float = 0.0
-    most_on_surfaces: float = np.inf
-    high_noise: bool = False
-    uneven: bool = False
-    height_axis: int | None = None
-    view: View | None = None
-    probes: Patches | None = None
-    thickness: float = 0.0
-
-
-@dataclass(frozen=True)
-class ScenePatches:
-    """How a pass shows patches of a scene, and what was read of them so, all (M,).
-
-    usual_distances: what the DistanceModule says of them in the usual size; scales, distances: in which size each is
-    shown, and what it says of them there; noise_stds: the noise of each, in the unit ball; flat: whether that is all
-    that keeps it from being flat.
-    """
-
-    usual_distances: Floats
-    scales: Floats
-    distances: Floats
-    noise_stds: Floats
-    flat: npt.NDArray[np.bool_]
 
 
 class NoiseReader:
@@ -231,7 +184,7 @@ class NoiseReader:
         reading = Reading(distance, noise, False, sampling, noise_in_radii=in_radii, view=view, probes=probes)
         if not self._zoom:
             return reading
-        noise = self._reread(positions, tiling, noise)
+        noise = self._reread(positions, tiling, self._reread_dense(positions, tiling, noise, in_radii))
         # What lies along beams alone is shown as it is: larger, walls of it become two.
         zoom, radius = 1.0 if view else zoom_of(noise, probes.radii), float(np.median(probes.radii))
         return replace(
@@ -255,6 +208,15 @@ class NoiseReader:
             zoom = zoom_of_rest(noise, self._read_at_zoom(positions, tiling, _REREAD_ZOOMS[0]))
         distance = float(np.median(distances))
         return Reading(distance, noise, False, first.sampling, zoom, probes=probes, thickness=thickness)
+
+    def _reread_dense(self, positions: Floats, tiling: Tiling, noise: float, in_radii: float) -> float:
+        """Return the noise of an object where it is so large in its patches' radii that they do not show all of it."""
+        parts, limit = 2, _DENSE_RADII
+        while in_radii > limit and len(positions) >= parts * _REREAD_POINTS:
+            some, probes = self._part(positions, tiling, parts)
+            noise = max(noise, self._read_part_at_zoom(some, probes, 1.0))
+            in_radii, parts, limit = noise_in_radii(noise, probes.radii), 2 * parts, _TOLD_RADII
+        return noise
 
     def _reread(self, positions: Floats, tiling: Tiling, noise: float) -> float:
         """Return the noise of an object where it may be more than the table knows."""

@@ -16,10 +16,11 @@ from straightpcf.model.cpus import use_one_thread_if_forked
 from straightpcf.model.distinct import Distinct, cell_of
 from straightpcf.model.layers import Layers
 from straightpcf.model.neighbourhoods import INNER_SHARE
-from straightpcf.model.noise import NoiseReader, Reading
+from straightpcf.model.noise import NoiseReader
 from straightpcf.model.normalize import CloudFrame, patch_scales
 from straightpcf.model.outliers import FAR_OUT, NEIGHBOURS, far_out, isolated, without_data
 from straightpcf.model.patches import Patches
+from straightpcf.model.reading import Reading
 from straightpcf.model.restraint import restrained_step, trusted_noise_stds
 from straightpcf.model.result import DenoiseResult, FinishedPatch
 from straightpcf.model.spread import ROUNDS
@@ -77,13 +78,12 @@ class Run:
         self._take()
         self.without_data_count = self._set_aside(without_data(self.points.xyz, np.bincount(self.points.inverse)))
         self.apart_count = self._set_aside(self._apart())
-        self.iterations, self._progress = 0, 0.0
         self.moved = np.zeros_like(self.points.xyz)  # in the unit-ball frame
         self.held_back = np.zeros(len(self.moved), dtype=bool)
         self.steps = ""  # what is said of points that are steps, and were moved to anywhere in these
         self.layers: Layers | None = None  # that the points lie in, as a depth camera's
         self.readings: list[Reading] = []  # before each pass, and after the last
-        self._rounds = ROUNDS  # of spreading, before each pass but the first
+        self.iterations, self._progress, self._rounds = 0, 0.0, ROUNDS  # of spreading, before all passes but the first
         self.noise_after = 0.0  # of what comes out, in the unit-ball frame
         origin = -self.frame.centre / (self.frame.radius or np.inf)  # nobody asks for that of one place
         self.reader = NoiseReader(

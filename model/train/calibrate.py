@@ -14,7 +14,7 @@ import numpy.typing as npt
 from straightpcf.model.calibration import FEW_POINTS, Calibration
 from straightpcf.model.filter import Filter, Run
 from straightpcf.model.metrics import chamfer_distance
-from straightpcf.model.noise import Reading
+from straightpcf.model.reading import Reading
 from straightpcf.points.options import DenoiseOptions
 
 __all__ = ["NOISE_LEVELS", "Trace", "calibrate", "every_pass", "loss", "noise_table", "passes", "trace"]

@@ -304,6 +304,12 @@ def test_the_first_pass_over_an_object_is_shown_in_the_size_of_its_noise(
     assert all(0.015 < noise < 0.03 for noise in seen)
 
 
+@pytest.mark.slow
+def test_noise_as_large_as_the_patches_of_dense_points_is_read(shipped: Filter) -> None:
+    result = shipped.denoise(noisy(torus(300_000), 0.02), ONE_PASS)
+    assert result.noise_before == pytest.approx(0.02, rel=0.15)
+
+
 def test_a_part_with_more_noise_is_filtered_like_a_cloud_with_as_much(shipped: Filter) -> None:
     clean = torus(4000)
     loud = clean[:, 0] > 0.3

@@ -54,6 +54,22 @@ def test_noise_is_high_where_it_is_read_so_far_around_and_near(far: float, near:
 _WIDE = Calibration(noise=(0.0, 0.06))
 
 
+class SaysAtMost(Says):
+    """Reads the noise there is, but no more than a share of a patch's radius, as of patches that are full of it."""
+
+    def distances(self, positions: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
+        return np.minimum(self.near, 0.16 * cut.radii) * scales / _WIDE.noise[-1]
+
+
+@pytest.mark.parametrize("noise", [0.025, 0.035, 0.045])
+def test_of_dense_points_noise_is_read_of_parts_whose_patches_show_it_all(noise: float) -> None:
+    positions = sphere(100_000)  # patches of radius 0.2
+    reader = NoiseReader(SaysAtMost(noise, noise), _WIDE, tile, zoom=True)  # type: ignore[arg-type]
+    reading = reader.read(positions, tile(positions), None)
+    assert not reading.scene
+    assert reading.noise_std == pytest.approx(noise)
+
+
 class SaysWhere(Says):
     """Reads one noise std where x is above a limit, another where it is below."""
 

@@ -7,8 +7,8 @@ import pytest
 
 from straightpcf.model.filter import Run, load_filter
 from straightpcf.model.neighbourhoods import Neighbourhoods, neighbourhoods
-from straightpcf.model.noise import Reading
 from straightpcf.model.patches import Patches
+from straightpcf.model.reading import Reading
 from straightpcf.model.restraint import (
     along_heights,
     held_to_lines,
