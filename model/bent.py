@@ -26,8 +26,10 @@ Look = Callable[[int], tuple[Floats, Patches]]
 _BENT_WITHIN, _BENT_SHARE = 0.1, 0.8
 _BENT_STDS, _PART_STDS = 1.25, 1.5
 # With more noise than any in training a sheet ends in layers, which cost more than what larger patches take of a shape.
-# So much is read of 4 % on sheets: somewhat less than there is.
-_LAYERS_NOISE, _LAYERS_BENT_STDS, _LAYERS_PART_STDS = 0.0325, 1.4, 2.5
+# So much is read of 4 % on sheets: somewhat less than there is. Of 3 % on a body up to 3.7 % is read, so that the first
+# question is asked less strictly of more than that alone.
+_LAYERS_NOISE, _LAYERS_PART_STDS = 0.0325, 2.5
+_LOUD_NOISE, _LOUD_BENT_STDS = 0.038, 1.4
 # From so much on walls are read as noise that are not, and then lie no farther from a quadric than that.
 _MOST_NOISE = 0.055
 # The kurtosis of what is off the quadric, in half of those patches: normal noise has 3, and somewhat less where a patch
@@ -43,14 +45,15 @@ def parts_of_object(noise_std: float, radii: Floats, count: int, look: Look) -> 
     usual, bent = (parts_of(noise_std, radii, count, bent=is_so) for is_so in (False, True))
     if bent <= usual[-1:] or noise_std > _MOST_NOISE:
         return usual
-    layers = noise_std > _LAYERS_NOISE
+    bent_stds = _LOUD_BENT_STDS if noise_std > _LOUD_NOISE else _BENT_STDS
+    part_stds = _LAYERS_PART_STDS if noise_std > _LAYERS_NOISE else _PART_STDS
     stds, kurtoses = off_quadrics(*look(max(1, round((noise_in_radii(noise_std, radii) / _BENT_WITHIN) ** 2))))
-    if np.quantile(stds, _BENT_SHARE) > (_LAYERS_BENT_STDS if layers else _BENT_STDS) * noise_std:
+    if np.quantile(stds, _BENT_SHARE) > bent_stds * noise_std:
         return usual
     if not _LEAST_KURTOSIS < np.median(kurtoses) < _MOST_KURTOSIS:
         return usual
     of_parts, _ = off_quadrics(*look(bent[0]))
-    return bent if np.median(of_parts) < (_LAYERS_PART_STDS if layers else _PART_STDS) * noise_std else usual
+    return bent if np.median(of_parts) < part_stds * noise_std else usual
 
 
 def off_quadrics(positions: Floats, patches: Patches) -> tuple[Floats, Floats]:

@@ -99,6 +99,14 @@ def test_where_layers_are_to_be_feared_a_sheet_may_bend_more_within_a_patch_of_a
     assert _parts(_hills, 0.04)[0] == _parts(_hills, 0.04)[2]
 
 
+def test_as_much_noise_as_is_read_of_bodies_with_the_training_noise_does_not_excuse_what_is_off_quadrics() -> None:
+    """1.35 and 1.27 noise stds off them, as a little of a head with 3 % may be that is read as 3.3 %."""
+    for read, taken in ((0.037, False), (0.0395, True)):
+        parts, usual, bent, _ = _parts(_square, 0.05, read=read)
+        assert parts == (bent if taken else usual)
+        assert usual != bent
+
+
 @pytest.mark.parametrize(("shape", "noise_std"), [(_torus, 0.03), (_torus, 0.04), (_slab, 0.03), (_slab, 0.04)])
 def test_a_body_and_walls_are_not(shape: Callable[[np.random.Generator], Floats], noise_std: float) -> None:
     parts, usual, bent, _ = _parts(shape, noise_std)
