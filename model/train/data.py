@@ -38,6 +38,7 @@ __all__ = [
     "REACH",
     "SCALES",
     "STRETCH",
+    "TAILLESS",
     "TAILS",
     "TOUCH_UNTIL",
     "UNEQUAL",
@@ -64,10 +65,11 @@ FIRST_PASSES = 0.5
 PASSED = 0.25
 # Somewhat smaller than the filter shows them: training with more noise than this loses thin walls (docs/training.md).
 _SHOWN_NOISE, _SMALLEST_ZOOM = 0.027, 0.9
-# The share of patches whose noise is not the paper's. Of these, some are heavy-tailed: each point's variance is drawn
-# from a gamma distribution of mean 1 (shape 1 makes a multivariate Laplace distribution, less makes heavier tails). And
-# some have unequal axes: their stds are lognormal.
-OTHER_NOISE = 0.25
+# The share of patches whose noise is not the paper's. Of these, some have no tails (uniform in a ball), and of the
+# others some are heavy-tailed: each point's variance is drawn from a gamma distribution of mean 1 (shape 1 makes a
+# multivariate Laplace distribution, less makes heavier tails). And some have unequal axes: their stds are lognormal.
+OTHER_NOISE = 0.32
+TAILLESS = 0.25
 HEAVY_TAILED, TAILS = 0.7, (0.6, 2.0)
 UNEQUAL, STRETCH = 0.4, 0.4
 # Others of them have it along one direction only, as depth cameras and scanners do that see a flat piece.
@@ -368,7 +370,10 @@ def _scattered(rng: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
         direction = rng.standard_normal(3)
         one_way: npt.NDArray[np.float64] = np.sqrt(3) * noise[:, :1] * direction / np.linalg.norm(direction)
         return one_way
-    if rng.random() < HEAVY_TAILED:
+    if rng.random() < TAILLESS:
+        # A ball of radius 1 has a variance of 1 / 5 along each axis.
+        noise *= np.sqrt(5) * rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(noise, axis=1, keepdims=True)
+    elif rng.random() < HEAVY_TAILED:
         shape = rng.uniform(*TAILS)
         noise *= np.sqrt(rng.gamma(shape, 1 / shape, (count, 1)))
     if rng.random() < UNEQUAL:
