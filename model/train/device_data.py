@@ -202,11 +202,11 @@ def _noise(clean: torch.Tensor, eyes: torch.Tensor) -> torch.Tensor:
     other, one_way, tailless, heavy, unequal, shape, along = torch.rand(7, batch_size, 1, 1, device=device)
     shape = TAILS[0] + (TAILS[1] - TAILS[0]) * shape
     variance = torch._standard_gamma(shape.expand(-1, count, -1)) / shape
-    heavier = noise * variance.sqrt()
+    # A ball of radius 1 has a variance of 1 / 5 along each axis.
     radius = math.sqrt(5) * torch.rand(batch_size, count, 1, device=device).pow(1 / 3)
     ball = radius * torch.nn.functional.normalize(noise, dim=2)
-    noise = torch.where((other < OTHER_NOISE) & (tailless >= TAILLESS) & (heavy < HEAVY_TAILED), heavier, noise)
-    noise = torch.where((other < OTHER_NOISE) & (tailless < TAILLESS), ball, noise)
+    tailed = torch.where(heavy < HEAVY_TAILED, noise * variance.sqrt(), noise)
+    noise = torch.where(other < OTHER_NOISE, torch.where(tailless < TAILLESS, ball, tailed), noise)
     stds = (STRETCH * torch.randn(batch_size, 1, 3, device=device)).exp()
     stretched = noise * stds / stds.square().mean(dim=2, keepdim=True).sqrt() @ random_rotations(batch_size, device)
     noise = torch.where((other < OTHER_NOISE) & (unequal < UNEQUAL), stretched, noise)
