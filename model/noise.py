@@ -184,9 +184,13 @@ class NoiseReader:
         reading = Reading(distance, noise, False, sampling, noise_in_radii=in_radii, view=view, probes=probes)
         if not self._zoom:
             return reading
-        noise = self._reread(positions, tiling, self._reread_dense(positions, tiling, noise, in_radii))
+        told = self._reread_dense(positions, tiling, noise, in_radii)
+        noise = self._reread(positions, tiling, told)
+        # What was read far around counts bends and walls in: shown as small as all that asks for, they would be lost.
+        # Where the table ends nothing else was told.
+        shown = noise if told >= _REREAD_ABOVE * self._largest_noise else (told + noise) / 2
         # What lies along beams alone is shown as it is: larger, walls of it become two.
-        zoom, radius = 1.0 if view else zoom_of(noise, probes.radii), float(np.median(probes.radii))
+        zoom, radius = 1.0 if view else zoom_of(shown, probes.radii), float(np.median(probes.radii))
         return replace(
             reading,
             noise_std=noise,

@@ -10,7 +10,7 @@ import pytest
 
 from straightpcf.model.calibration import Calibration
 from straightpcf.model.noise import NoiseReader
-from straightpcf.model.normalize import HIGH_NOISE, CloudFrame, patch_scales
+from straightpcf.model.normalize import HIGH_NOISE, CloudFrame, patch_scales, zoom_of
 from straightpcf.model.survey import survey
 from straightpcf.model.tiles import Tiling
 from tests.clouds import far_group, noisy, sphere, torus
@@ -21,14 +21,14 @@ _POINTS = 10_000
 class Says:
     """A processor that reads a noise std of a quarter of the points, and another of all of them shown at half size."""
 
-    def __init__(self, far: float, near: float) -> None:
-        self.far, self.near = far, near
+    def __init__(self, far: float, near: float, *, largest: float = 0.02) -> None:
+        self.far, self.near, self.largest = far, near, largest  # the default calibration's
         self.asked: list[npt.NDArray[np.int64]] = []  # of which seeds' patches, each time
 
     def distances(self, positions: npt.NDArray[np.float64], cut: Any, scales: npt.NDArray[np.float64]) -> Any:
         self.asked.append(cut.seeds)
         noise = self.far if len(positions) < _POINTS else self.near
-        return np.minimum(noise * scales / 0.02, 1.0)  # the default calibration
+        return np.minimum(noise * scales / self.largest, 1.0)
 
     survey = staticmethod(survey)
     mapper = map
@@ -49,6 +49,23 @@ def test_noise_is_high_where_it_is_read_so_far_around_and_near(far: float, near:
     assert reading.noise_std == pytest.approx(far)
     assert reading.high_noise is high
     assert not reading.high_noise or reading.noise_std > HIGH_NOISE
+
+
+@pytest.mark.parametrize(
+    ("told", "far", "shown"),
+    [(0.021, 0.029, 0.025), (0.025, 0.025, 0.025), (0.027, 0.029, 0.029)],  # where the table ends nothing is told
+)
+def test_an_object_is_shown_in_the_size_of_what_is_read_of_it_near_and_far_around(
+    told: float, far: float, shown: float
+) -> None:
+    positions = torus(_POINTS)
+    table = Calibration(noise=(0.0, 0.028))
+    reader = NoiseReader(Says(far, told, largest=0.028), table, tile, zoom=True)  # type: ignore[arg-type]
+    reading = reader.read(positions, tile(positions), None)
+    assert reading.noise_std == pytest.approx(far)
+    assert reading.probes is not None
+    assert 1 < reading.zoom < zoom_of(0.0, reading.probes.radii)  # neither limit has a part in it
+    assert reading.zoom == pytest.approx(zoom_of(shown, reading.probes.radii))
 
 
 _WIDE = Calibration(noise=(0.0, 0.06))
