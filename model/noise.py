@@ -186,8 +186,8 @@ class NoiseReader:
             return reading
         told = self._reread_dense(positions, tiling, noise, in_radii)
         noise = self._reread(positions, tiling, told)
-        # What was read far around counts bends and walls in: shown as small as all that asks for, they would be lost.
-        # Where the table ends nothing else was told.
+        # Far around bends and walls are read as noise, too: shown as small as that asks for, they are lost. A first
+        # reading at the end of the table says nothing of how much there is.
         shown = noise if told >= _REREAD_ABOVE * self._largest_noise else (told + noise) / 2
         # What lies along beams alone is shown as it is: larger, walls of it become two.
         zoom, radius = 1.0 if view else zoom_of(shown, probes.radii), float(np.median(probes.radii))
